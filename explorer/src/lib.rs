@@ -1,0 +1,17 @@
+//! Grows the secondary motion graph of a garment and publishes it.
+//!
+//! Wings: [`import`] reads scenes, characters, motion graphs and garments; [`builtin`] makes the
+//! built-in scene; [`grow`] explores (graph, metric, queue, jobs, journal); [`pack`] builds the
+//! basis, encodes and publishes.
+//!
+//! Non-goals: who is connected (they meet in the store), what a region's bytes mean (`codec`).
+
+pub mod builtin;
+pub mod grid;
+pub mod grow;
+pub mod import;
+pub mod pack;
+pub mod primary;
+pub mod scene;
+pub mod simulator;
+pub mod view;

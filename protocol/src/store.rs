@@ -1,0 +1,28 @@
+//! Where things lie in an object store. Paths are relative to the store's root, `/`-separated.
+
+use crate::ids::{ChunkHash, VersionNumber};
+
+/// Folder of chunks.
+pub const CHUNKS: &str = "chunks";
+/// Folder of manifests.
+pub const VERSIONS: &str = "versions";
+/// Folder of telemetry batches.
+pub const TELEMETRY: &str = "telemetry";
+
+/// `chunks/ab/abcdef...`: the first byte spreads the load over folders.
+pub fn chunk_path(hash: &ChunkHash) -> String {
+    let hex = hash.to_string();
+    format!("{CHUNKS}/{}/{hex}", &hex[..2])
+}
+
+/// `versions/00000000000000000001`: names sort like numbers.
+pub fn version_path(number: VersionNumber) -> String {
+    format!("{VERSIONS}/{:020}", number.0)
+}
+
+/// The number in a manifest's path, or `None` for another file.
+pub fn version_of_path(path: &str) -> Option<VersionNumber> {
+    let name = path.strip_prefix(VERSIONS)?.strip_prefix('/')?;
+    let all_digits = name.len() == 20 && name.bytes().all(|b| b.is_ascii_digit());
+    all_digits.then(|| name.parse().ok().map(VersionNumber))?
+}
