@@ -12,14 +12,52 @@ pub trait Simulator: Send {
     ///
     /// # Errors
     /// Whatever went wrong, in words; the job is given up, the run goes on.
-    fn step(&mut self, state: &GridState, edge: EdgeId) -> Result<GridState, SimulateError>;
+    fn step(&mut self, state: &GridState, edge: EdgeId) -> Result<Frame, SimulateError>;
 
     /// The garment draped on the start pose: checked against the body in the rest pose, brought
     /// to the start pose over some frames, settled.
     ///
     /// # Errors
     /// As for `step`.
-    fn drape(&mut self) -> Result<GridState, SimulateError>;
+    fn drape(&mut self) -> Result<Frame, SimulateError>;
+}
+
+/// A simulated frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// The state at its end.
+    pub state: GridState,
+    /// What was measured on it.
+    pub quality: FrameQuality,
+}
+
+/// Measures of one frame's end, or, added up, of many frames.
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct FrameQuality {
+    /// Frames measured.
+    pub frames: u64,
+    /// Vertices times frames measured.
+    pub vertex_frames: u64,
+    /// Of these, deeper than 5 mm in the body and not held between two body parts.
+    pub deep_vertex_frames: u64,
+    /// Of these, deeper than 5 mm and held between two body parts.
+    pub pinched_vertex_frames: u64,
+    /// Deepest vertex that is not held between two body parts [m].
+    pub depth_max_m: f32,
+    /// Largest strain of an edge (0.1: 10 % longer than at rest).
+    pub stretch_max: f32,
+}
+
+impl FrameQuality {
+    /// Adds the measures of other frames.
+    pub fn add(&mut self, other: &Self) {
+        self.frames += other.frames;
+        self.vertex_frames += other.vertex_frames;
+        self.deep_vertex_frames += other.deep_vertex_frames;
+        self.pinched_vertex_frames += other.pinched_vertex_frames;
+        self.depth_max_m = self.depth_max_m.max(other.depth_max_m);
+        self.stretch_max = self.stretch_max.max(other.stretch_max);
+    }
 }
 
 /// A frame that could not be simulated.
