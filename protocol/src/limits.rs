@@ -14,6 +14,8 @@ pub const POSES_MAX: usize = 1 << 20;
 pub const EDGES_MAX: usize = 1 << 21;
 /// Joints of a skeleton.
 pub const JOINTS_MAX: usize = 1024;
+/// Capsules that stand for a body.
+pub const COLLIDERS_MAX: usize = 4096;
 /// Vertices of a garment or a body.
 pub const VERTICES_MAX: usize = 1 << 20;
 /// Triangles of a garment or a body.
@@ -28,3 +30,8 @@ pub const COLUMNS_MAX: usize = 2048;
 pub const NAME_BYTES_MAX: usize = 256;
 /// States in one link page.
 pub const LINK_PAGE_STATES: usize = 256;
+/// Region chunks and link pages of a manifest, all garments together: at up to 48 bytes each they
+/// fit into `MANIFEST_BYTES_MAX`, with `GARMENTS_MAX` garments of `GENERATIONS_MAX` generations.
+pub const MANIFEST_ENTRIES_MAX: usize = 1 << 19;
+/// Basis generations of a garment.
+pub const GENERATIONS_MAX: usize = 64;

@@ -3,6 +3,16 @@
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{ChunkHash, GarmentId, StateId, VersionNumber};
+use crate::limits;
+use crate::sign::{PublisherKey, SIGNATURE_BYTES, Signature, SigningKey};
+use crate::wire::{DecodeError, Format, at_most, check_name, ensure};
+
+const MANIFEST: Format = Format {
+    what: "manifest",
+    magic: *b"TMAN",
+    version: 1,
+    bytes_max: limits::MANIFEST_BYTES_MAX - SIGNATURE_BYTES,
+};
 
 /// A chunk by name and size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -22,6 +32,32 @@ pub struct Manifest {
     pub previous: Option<ChunkHash>,
     /// The garments of the world, by id.
     pub garments: Vec<GarmentVersion>,
+}
+
+/// A manifest as it is stored and sent: its unsigned bytes, then the 64 bytes of the signature.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SignedManifest {
+    /// What was signed.
+    pub manifest: Manifest,
+    /// By whom, see [`SignedManifest::verify`].
+    pub signature: Signature,
+}
+
+/// Why a manifest was refused.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ManifestError {
+    /// Damaged, or it says something impossible.
+    #[error(transparent)]
+    Decode(#[from] DecodeError),
+    /// Not from the publisher that is expected.
+    #[error("version {number} is not signed by publisher {publisher}; it may be forged")]
+    NotSigned {
+        /// Its number.
+        number: VersionNumber,
+        /// Who should have signed it.
+        publisher: PublisherKey,
+    },
 }
 
 /// One garment in a version.
@@ -48,7 +84,7 @@ pub struct GarmentVersion {
 }
 
 /// A basis generation.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct GenerationRef {
     /// Encoded columns.
     pub chunk: ChunkRef,
@@ -57,7 +93,7 @@ pub struct GenerationRef {
 }
 
 /// A chunk of regions and the states that it covers.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct RegionChunkRef {
     /// A `RegionChunk`.
     pub chunk: ChunkRef,
@@ -94,4 +130,149 @@ pub struct VersionStats {
     pub codec_rms_error_m: f32,
     /// Raw f32 positions of all its states, in bytes.
     pub raw_bytes: u64,
+}
+
+impl Manifest {
+    /// The bytes that are hashed and signed.
+    ///
+    /// # Panics
+    /// If [`Manifest::check`] fails.
+    pub fn encode(&self) -> Vec<u8> {
+        self.check().expect("a manifest is checked before it is written");
+        MANIFEST.encode(self)
+    }
+
+    /// Reads unsigned bytes and checks them.
+    ///
+    /// # Errors
+    /// Damaged bytes, or a manifest that breaks a rule of [`Manifest::check`].
+    pub fn decode(bytes: &[u8]) -> Result<Self, DecodeError> {
+        let manifest: Self = MANIFEST.decode(bytes)?;
+        manifest.check()?;
+        Ok(manifest)
+    }
+
+    /// BLAKE3 of the unsigned bytes: what `previous` and differences name.
+    pub fn hash(&self) -> ChunkHash {
+        ChunkHash::of(&self.encode())
+    }
+
+    /// Signs it.
+    pub fn sign(self, key: &SigningKey) -> SignedManifest {
+        let signature = key.sign(&self.encode());
+        SignedManifest { manifest: self, signature }
+    }
+
+    /// The garment of this name.
+    pub fn garment(&self, name: &str) -> Option<&GarmentVersion> {
+        self.garments.iter().find(|garment| garment.name == name)
+    }
+
+    /// Numbered from 1; garments sorted by id, names unique; every list within its limit; region
+    /// chunks sorted and apart; figures finite.
+    ///
+    /// # Errors
+    /// The first rule that is broken, with its place.
+    pub fn check(&self) -> Result<(), DecodeError> {
+        self.check_garments().map_err(|why| MANIFEST.invalid(why))
+    }
+
+    fn check_garments(&self) -> Result<(), String> {
+        ensure(self.number.0 > 0, || "version 0; the first is 1".into())?;
+        at_most("garments", self.garments.len(), limits::GARMENTS_MAX)?;
+        let entries = self.garments.iter().map(|g| g.links.len() + g.regions.len());
+        at_most("region chunks and link pages", entries.sum(), limits::MANIFEST_ENTRIES_MAX)?;
+        let mut names = std::collections::BTreeSet::new();
+        let mut id_before = None;
+        for garment in &self.garments {
+            ensure(id_before < Some(garment.id), || "garments are not sorted by id".into())?;
+            id_before = Some(garment.id);
+            check_name("a garment", &garment.name)?;
+            ensure(names.insert(&garment.name), || format!("two garments {:?}", garment.name))?;
+            garment.check().map_err(|why| format!("garment {:?}: {why}", garment.name))?;
+        }
+        Ok(())
+    }
+}
+
+impl SignedManifest {
+    /// Bytes to store: at `store::version_path(number)`.
+    pub fn encode(&self) -> Vec<u8> {
+        let mut bytes = self.manifest.encode();
+        bytes.extend_from_slice(&self.signature.0);
+        bytes
+    }
+
+    /// Reads and checks all but who signed it.
+    ///
+    /// # Errors
+    /// Damaged bytes, or a manifest that breaks a rule of [`Manifest::check`].
+    pub fn decode(bytes: &[u8]) -> Result<Self, DecodeError> {
+        let malformed = DecodeError::Malformed { what: MANIFEST.what, bytes: bytes.len() };
+        let (unsigned, signature) = bytes.split_last_chunk().ok_or(malformed)?;
+        Ok(Self { manifest: Manifest::decode(unsigned)?, signature: Signature(*signature) })
+    }
+
+    /// Checks who signed it.
+    ///
+    /// # Errors
+    /// Someone else did, or nobody.
+    pub fn verify(&self, publisher: &PublisherKey) -> Result<(), ManifestError> {
+        if publisher.has_signed(&self.manifest.encode(), &self.signature) {
+            return Ok(());
+        }
+        let number = self.manifest.number;
+        Err(ManifestError::NotSigned { number, publisher: *publisher })
+    }
+
+    /// Reads, checks and verifies.
+    ///
+    /// # Errors
+    /// Damaged, impossible, or not signed by `publisher`.
+    pub fn open(bytes: &[u8], publisher: &PublisherKey) -> Result<Self, ManifestError> {
+        let signed = Self::decode(bytes)?;
+        signed.verify(publisher)?;
+        Ok(signed)
+    }
+}
+
+impl GarmentVersion {
+    /// Every chunk it lists, without order or duplicates removed.
+    pub fn chunks(&self) -> impl Iterator<Item = ChunkRef> + '_ {
+        [self.scene, self.mesh]
+            .into_iter()
+            .chain(self.generations.iter().map(|generation| generation.chunk))
+            .chain(self.links.iter().copied())
+            .chain(self.regions.iter().map(|region| region.chunk))
+    }
+
+    fn check(&self) -> Result<(), String> {
+        check_name("its codec", &self.codec)?;
+        at_most("generations", self.generations.len(), limits::GENERATIONS_MAX)?;
+        let columns = self.generations.iter().map(|generation| usize::from(generation.columns));
+        at_most("columns", columns.sum(), limits::COLUMNS_MAX)?;
+        let mut free_from = 0;
+        for (index, region) in self.regions.iter().enumerate() {
+            let first = region.first_state.0;
+            ensure(first >= free_from && first < limits::STATES_MAX, || {
+                format!("region chunk {index} begins at state {first}, out of order or range")
+            })?;
+            ensure(region.state_count > 0, || format!("region chunk {index} covers no state"))?;
+            free_from = first + u64::from(region.state_count);
+        }
+        for chunk in self.chunks() {
+            at_most("bytes in a chunk", chunk.bytes as usize, limits::CHUNK_BYTES_MAX)?;
+        }
+        self.stats.check()
+    }
+}
+
+impl VersionStats {
+    fn check(&self) -> Result<(), String> {
+        let figures =
+            [self.worst_error_m, self.mean_error_m, self.codec_max_error_m, self.codec_rms_error_m];
+        ensure(figures.iter().all(|m| m.is_finite() && *m >= 0.0), || {
+            format!("errors of {figures:?} m are no errors")
+        })
+    }
 }
