@@ -1,7 +1,7 @@
 //! Pictures for people who look: is the cloth where it should be, and does the error fall?
 //!
 //! # Goals
-//! - A mesh becomes a picture within some tens of milliseconds, on any machine, without a graphics card.
+//! - A mesh becomes a picture within some tens of milliseconds, without a graphics card.
 //! - Faults are to be seen: the back of a triangle has another hue than its front, a contact shadow
 //!   shows what floats, colours by vertex show strain or error.
 //! - Equal input, equal bytes, so that a picture can be a test.
@@ -29,17 +29,23 @@
 //! # Map
 //! | module | what |
 //! | --- | --- |
+//! | [`glb`] | a moving clip of meshes as binary glTF, for Blender and others |
 //! | [`image`] | an RGB picture: fill, line, text, PNG in and out |
+//! | [`plot`] | line plots, as SVG and as a picture |
 //! | [`raster`] | meshes to a picture: z-buffer, two-sided shading, ground and its shadow |
 //! | [`sheet`] | a grid of pictures with captions |
 
 mod camera;
 mod font;
+pub mod glb;
 pub mod image;
+pub mod plot;
 pub mod raster;
 pub mod sheet;
 
 pub use camera::Camera;
+pub use glb::{Clip, ClipMesh, GlbError, glb};
 pub use image::{Image, ImageError, Rgb};
+pub use plot::{Plot, Series};
 pub use raster::{Layer, Paint, RasterError, View, render};
 pub use sheet::Sheet;

@@ -60,7 +60,7 @@ pub struct View {
     pub background: Rgb,
     /// Height of the ground, in metres; without it, nothing is drawn below or cast on it.
     pub ground: Option<f32>,
-    /// Direction towards the key light; without it, the light comes over the viewer's left shoulder.
+    /// Direction towards the key light; without it, it comes over the viewer's left shoulder.
     pub key: Option<Vec3>,
 }
 
@@ -154,11 +154,11 @@ pub fn normals(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<Vec3> {
         let [a, b, c] = corners.map(|corner| positions[corner as usize]);
         let cross = (b - a).cross(c - a);
         let reach = (b - a).length_squared().max((c - a).length_squared());
-        // A sliver's normal is rounding noise; not a number fails the comparison, too.
-        if !(cross.length() > 1e-5 * reach) {
+        // A sliver's normal is rounding noise.
+        if cross.length() <= 1e-5 * reach {
             continue;
         }
-        let face = cross.normalize_or_zero();
+        let Some(face) = cross.try_normalize() else { continue };
         let angle = |at: Vec3, left: Vec3, right: Vec3| {
             let (left, right) = ((left - at).normalize_or_zero(), (right - at).normalize_or_zero());
             left.cross(right).length().atan2(left.dot(right))
@@ -245,7 +245,7 @@ struct Shader<'a> {
 }
 
 impl Shader<'_> {
-    /// Mixes the samples of each pixel; a surface is shaded once a pixel, at the mean of its samples.
+    /// Mixes the samples of each pixel; a surface is shaded once a pixel, amid its samples.
     fn resolve(&self, samples: &Samples, image: &mut Image) {
         let width = image.width() as usize;
         let wide = samples.width as usize;
