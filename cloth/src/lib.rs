@@ -10,12 +10,21 @@
 //! function says otherwise.
 //!
 //! Map: [`rigid`] rigid transforms; [`body`] skeleton, poses, skinning; [`mesh`] garment
-//! topology; [`material`] physical constants; [`model`] what does not change during a run;
-//! [`solver`] the step; [`measure`] strain, penetration, clearance.
+//! topology; [`material`] physical constants; [`surface`], [`bvh`], [`triangle`] closest points of a
+//! moving surface; [`measure`] strain, penetration, clearance.
 
 pub mod body;
+pub mod bvh;
+pub mod material;
+pub mod measure;
+pub mod mesh;
 pub mod rigid;
+pub mod surface;
+pub mod triangle;
 
 pub use body::{Body, Pose, Skeleton};
 pub use glam::{Quat, Vec3};
+pub use material::Material;
+pub use mesh::{Mesh, MeshError};
 pub use rigid::Rigid;
+pub use surface::Surface;

@@ -39,42 +39,8 @@ pub struct Garment {
     pub fabric: Fabric,
 }
 
-/// Physical constants of the cloth, as a scene file gives them. Units: SI.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Fabric {
-    /// Areal density [kg/m^2].
-    pub density: f32,
-    /// Membrane stiffness E h [N/m].
-    pub stretch: f32,
-    /// Shear stiffness G h [N/m].
-    pub shear: f32,
-    /// Bending stiffness per width [N m].
-    pub bend: f32,
-    /// Coulomb friction against the body.
-    pub friction: f32,
-    /// Drag coefficient of a sheet normal to the flow (1.28 for a plate).
-    pub drag: f32,
-    /// Stiffness-proportional damping time [s].
-    pub damping_s: f32,
-    /// Distance kept from the body [m].
-    pub offset: f32,
-}
-
-impl Default for Fabric {
-    /// A medium woven fabric (between the pants and the tablecloth of Wang et al. 2011).
-    fn default() -> Self {
-        Self {
-            density: 0.2,
-            stretch: 1000.0,
-            shear: 400.0,
-            bend: 5e-5,
-            friction: 0.3,
-            drag: 1.28,
-            damping_s: 0.002,
-            offset: 0.004,
-        }
-    }
-}
+/// Physical constants of the cloth, as a scene file gives them.
+pub use cloth::Material as Fabric;
 
 /// How states are compared, and how far the graph is grown.
 #[derive(Debug, Clone, Copy, PartialEq)]
