@@ -1,1 +1,281 @@
-//! To be filled.
+//! Reads scenes: characters, motion graphs and garments in other people's formats.
+//!
+//! [`load_scene`] is the door: `robe` is made by [`crate::builtin`], `dress` is shipped as TOML
+//! and reads the data folder, anything else is a scene file ([`scene_file`]).
+
+pub mod align;
+mod animation;
+pub mod character;
+pub mod components;
+pub mod garment;
+pub mod gltf_file;
+pub mod motion_graph;
+#[cfg(test)]
+mod real_data;
+pub mod refine;
+pub mod scene_file;
+pub mod transition;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use protocol::PoseId;
+
+use self::character::{Character, CharacterError};
+use self::garment::{GarmentError, Surface};
+use self::gltf_file::FILE_BYTES_MAX;
+use self::motion_graph::{GraphFile, GraphReport, MotionGraphError};
+use self::scene_file::{MotionSource, SceneFile, SceneFileError, resolve_path};
+use self::transition::Transition;
+use crate::primary::PrimaryGraph;
+use crate::scene::{Garment, Scene};
+
+/// The TOML of the scene `dress`.
+const DRESS: &str = include_str!("../../../scenes/dress.toml");
+
+/// Why a scene could not be loaded: always the file, the place in it and what to do.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SceneError {
+    /// A file could not be opened.
+    #[error("{}: {source} ({key} names it; check the path)", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// The key that names it.
+        key: String,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The scene file itself.
+    #[error("{}: {source}", path.display())]
+    File {
+        /// The scene file.
+        path: PathBuf,
+        /// What is wrong.
+        source: SceneFileError,
+    },
+    /// The character.
+    #[error("{}: {source}", path.display())]
+    Character {
+        /// Its file.
+        path: PathBuf,
+        /// What is wrong.
+        source: CharacterError,
+    },
+    /// The motion graph.
+    #[error("{}: {source}", path.display())]
+    MotionGraph {
+        /// Its file, or the scene file where it is computed.
+        path: PathBuf,
+        /// What is wrong.
+        source: MotionGraphError,
+    },
+    /// The garment.
+    #[error("{}: {source}", path.display())]
+    Garment {
+        /// Its file.
+        path: PathBuf,
+        /// What is wrong.
+        source: GarmentError,
+    },
+}
+
+/// A scene, and what was dropped on the way to it.
+#[derive(Debug, Clone)]
+pub struct Loaded {
+    /// The scene.
+    pub scene: Scene,
+    /// What fell outside the largest strongly connected component; `None` for built-in scenes.
+    pub graph: Option<GraphReport>,
+}
+
+/// Loads a scene by name (`robe`, `dress`) or from a file.
+///
+/// * `data_dir`: the data folder, for `dress` and for `$TOILE_DATA` in files (see [`data_dir`]).
+///
+/// # Errors
+/// File, place and remedy of whatever is wrong.
+pub fn load_scene(name_or_path: &str, data_dir: Option<&Path>) -> Result<Scene, SceneError> {
+    load(name_or_path, data_dir).map(|loaded| loaded.scene)
+}
+
+/// As [`load_scene`], with the report on the motion graph.
+///
+/// # Errors
+/// As for [`load_scene`].
+pub fn load(name_or_path: &str, data_dir: Option<&Path>) -> Result<Loaded, SceneError> {
+    match name_or_path {
+        "dress" => load_text(DRESS, Path::new("scenes/dress.toml"), data_dir),
+        _ => {
+            let path = Path::new(name_or_path);
+            let bytes = read(path, "the command line")?;
+            let text = String::from_utf8(bytes).map_err(|_| SceneError::File {
+                path: path.to_owned(),
+                source: SceneFileError::Toml("is not UTF-8 text; give a TOML file".to_owned()),
+            })?;
+            load_text(&text, path, data_dir)
+        }
+    }
+}
+
+/// The data folder: the environment's `TOILE_DATA`, else the first `shared/data` beside the
+/// current folder or one above it that holds a character.
+pub fn data_dir() -> Option<PathBuf> {
+    if let Some(folder) = std::env::var_os("TOILE_DATA") {
+        return Some(PathBuf::from(folder));
+    }
+    let here = std::env::current_dir().ok()?;
+    let beside = |folder: &Path| folder.join("shared/data");
+    here.ancestors().map(beside).find(|data| data.join("character.glb").is_file())
+}
+
+/// A character with all clips of a scene file, and the path of its file.
+///
+/// # Errors
+/// As for [`load_scene`].
+pub fn load_character(
+    file: &SceneFile,
+    path: &Path,
+    data_dir: Option<&Path>,
+) -> Result<(Character, PathBuf), SceneError> {
+    let place = Place { scene: path, data: data_dir };
+    let glb = place.resolve("character.file", &file.character.file)?;
+    let bytes = read(&glb, "character.file")?;
+    let character = character::read_character(&bytes, glb.parent(), file.fps)
+        .map_err(|source| SceneError::Character { path: glb.clone(), source })?;
+    Ok((character, glb))
+}
+
+/// Loads a scene from the text of a scene file that lies (or would lie) at `path`.
+///
+/// # Errors
+/// As for [`load_scene`].
+pub fn load_text(text: &str, path: &Path, data_dir: Option<&Path>) -> Result<Loaded, SceneError> {
+    let place = Place { scene: path, data: data_dir };
+    let file = SceneFile::parse(text).map_err(|e| place.error(e))?;
+    let (character, _) = load_character(&file, path, data_dir)?;
+    let (primary, graph) = load_primary(&file, &character, &place)?;
+    let start = start_pose(&file, &primary).map_err(|e| place.error(e))?;
+    let garment = load_garment(&file, &character, &place)?;
+    let scene = Scene {
+        name: file.name.clone(),
+        body: Arc::new(character.body),
+        primary: Arc::new(primary),
+        start,
+        garment,
+        exploration: file.exploration().map_err(|e| place.error(e))?,
+    };
+    Ok(Loaded { scene, graph: Some(graph) })
+}
+
+struct Place<'a> {
+    scene: &'a Path,
+    data: Option<&'a Path>,
+}
+
+impl Place<'_> {
+    fn error(&self, source: SceneFileError) -> SceneError {
+        SceneError::File { path: self.scene.to_owned(), source }
+    }
+
+    fn resolve(&self, key: &str, written: &str) -> Result<PathBuf, SceneError> {
+        let folder = self.scene.parent().unwrap_or(Path::new(""));
+        resolve_path(key, written, folder, self.data).map_err(|e| self.error(e))
+    }
+}
+
+fn read(path: &Path, key: &str) -> Result<Vec<u8>, SceneError> {
+    let error = |source| SceneError::Read { path: path.to_owned(), key: key.to_owned(), source };
+    let length = std::fs::metadata(path).map_err(error)?.len();
+    if length > FILE_BYTES_MAX as u64 {
+        return Err(error(std::io::Error::other(format!("over {FILE_BYTES_MAX} bytes"))));
+    }
+    std::fs::read(path).map_err(error)
+}
+
+fn load_primary(
+    file: &SceneFile,
+    character: &Character,
+    place: &Place<'_>,
+) -> Result<(PrimaryGraph, GraphReport), SceneError> {
+    let source = file.motion_source().map_err(|e| place.error(e))?;
+    let (path, transitions) = transitions(&source, file, character, place)?;
+    motion_graph::build(&character.body.skeleton, &character.clips, file.fps, &transitions)
+        .map_err(|source| SceneError::MotionGraph { path, source })
+}
+
+fn transitions(
+    source: &MotionSource,
+    file: &SceneFile,
+    character: &Character,
+    place: &Place<'_>,
+) -> Result<(PathBuf, Vec<Transition>), SceneError> {
+    match source {
+        MotionSource::File(written) => {
+            let path = place.resolve("motion_graph.file", written)?;
+            let bytes = read(&path, "motion_graph.file")?;
+            let resolve = || {
+                let graph = GraphFile::parse(&String::from_utf8_lossy(&bytes))?;
+                graph.resolve(&character.clips, file.fps)
+            };
+            match resolve() {
+                Ok(transitions) => Ok((path, transitions)),
+                Err(source) => Err(SceneError::MotionGraph { path, source }),
+            }
+        }
+        MotionSource::Threshold(_) | MotionSource::Reach(_) => {
+            Err(place.error(SceneFileError::Value {
+                key: "motion_graph".to_owned(),
+                problem: "is read from a file; write one with toile scene graph".to_owned(),
+            }))
+        }
+    }
+}
+
+fn start_pose(file: &SceneFile, primary: &PrimaryGraph) -> Result<PoseId, SceneFileError> {
+    let Some(start) = &file.start else { return Ok(PoseId(0)) };
+    let clip = primary.clips().iter().position(|c| *c == start.clip);
+    let found = primary
+        .poses()
+        .iter()
+        .position(|p| !p.transition && Some(usize::from(p.clip)) == clip && p.frame == start.frame);
+    found.map(|pose| PoseId(pose as u32)).ok_or_else(|| SceneFileError::Value {
+        key: "start".to_owned(),
+        problem: format!(
+            "frame {} of clip {:?} is not in the motion graph's largest component; name another",
+            start.frame, start.clip
+        ),
+    })
+}
+
+fn load_garment(
+    file: &SceneFile,
+    character: &Character,
+    place: &Place<'_>,
+) -> Result<Garment, SceneError> {
+    let table = file.garment().map_err(|e| place.error(e))?;
+    let path = place.resolve("garment.file", &table.file)?;
+    let bytes = read(&path, "garment.file")?;
+    let attachments = table.attachments().map_err(|e| place.error(e))?;
+    let make = || {
+        let mut surface = Surface::read(&path, &bytes)?;
+        surface.check()?;
+        let file_vertices = surface.positions.len();
+        if let Some(edge_length_m) = table.edge_length_m {
+            surface.refine(edge_length_m)?;
+        }
+        let skeleton = &character.body.skeleton;
+        let attached = surface.attach(&attachments, skeleton, file_vertices)?;
+        Ok((surface, attached))
+    };
+    let (surface, attached) =
+        make().map_err(|source| SceneError::Garment { path: path.clone(), source })?;
+    Ok(Garment {
+        name: table.name.clone().unwrap_or_else(|| file.name.clone()),
+        positions: surface.positions,
+        triangles: surface.triangles,
+        attached,
+        fabric: table.fabric().map_err(|e| place.error(e))?,
+    })
+}

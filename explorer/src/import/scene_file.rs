@@ -1,0 +1,372 @@
+//! The TOML of a scene: what is written there, and nothing else (unknown keys are refused).
+//!
+//! ```toml
+//! name = "dress"
+//! fps = 30.0                                   # default 30
+//! start = { clip = "walk_figure8", frame = 40 } # default: the first pose
+//!
+//! [character]
+//! file = "$TOILE_DATA/character.glb"
+//! clips = ["more/dance.bvh"]                   # BVH for the same skeleton; default: none
+//!
+//! [motion_graph]
+//! file = "motion-graph.json"                   # or computed: threshold_m or reach_s
+//!
+//! [garment]
+//! file = "$TOILE_DATA/garments/dress_long.obj"
+//! name = "dress"                               # default: the scene's name
+//! edge_length_m = 0.03                         # default: as the file is
+//! attach = [{ loop_near = "Neck" }]            # or near + within_m, or vertices
+//!
+//! [garment.material]                           # SI; each has a default
+//! density = 0.2
+//!
+//! [exploration]                                # each has a default
+//! tolerance_mm = 10.0
+//! ```
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use super::garment::Attachment;
+use crate::scene::{ExplorationSettings, Fabric};
+
+/// Frames per second that a scene may have.
+pub const FPS: [f32; 2] = [5.0, 240.0];
+
+/// Why a scene file was refused, without the file's name.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum SceneFileError {
+    /// TOML that cannot be read, or a key that is unknown, missing or of another type.
+    #[error("{0}")]
+    Toml(String),
+    /// More than one garment.
+    #[error("[garment] is given {0} times; a scene has exactly one garment for now: keep one")]
+    Garments(usize),
+    /// A value.
+    #[error("{key}: {problem}")]
+    Value {
+        /// Where.
+        key: String,
+        /// What is wrong and what to do.
+        problem: String,
+    },
+}
+
+/// A scene as written.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneFile {
+    /// Name of the scene.
+    pub name: String,
+    /// Frames per second.
+    #[serde(default = "default_fps")]
+    pub fps: f32,
+    /// Where exploration starts.
+    pub start: Option<StartTable>,
+    /// The character.
+    pub character: CharacterTable,
+    /// Its motion graph.
+    pub motion_graph: MotionGraphTable,
+    garment: OneOrMany,
+    /// How far to explore.
+    #[serde(default)]
+    pub exploration: ExplorationTable,
+}
+
+/// A frame of a clip.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StartTable {
+    /// Name of the clip.
+    pub clip: String,
+    /// Frame of it.
+    pub frame: u32,
+}
+
+/// The character's files.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CharacterTable {
+    /// glTF or GLB: the skinned body, and its animations.
+    pub file: String,
+    /// BVH files of the same skeleton, retargeted by joint names; clips are called like the
+    /// files and replace animations of that name.
+    #[serde(default)]
+    pub clips: Vec<String>,
+}
+
+/// The motion graph: a file, or computed.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MotionGraphTable {
+    /// JSON.
+    pub file: Option<String>,
+    /// Take every local minimum of the distance below this [m].
+    pub threshold_m: Option<f32>,
+    /// Take as few local minima as bring the median time to reach a clip below this [s].
+    pub reach_s: Option<f32>,
+}
+
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(untagged)]
+enum OneOrMany {
+    One(toml::Table),
+    Many(Vec<toml::Table>),
+}
+
+/// The garment.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GarmentTable {
+    /// OBJ, glTF or GLB, in the character's rest pose.
+    pub file: String,
+    /// Name in the world.
+    pub name: Option<String>,
+    /// Longest edge after refinement [m].
+    pub edge_length_m: Option<f32>,
+    /// What is held to the body.
+    #[serde(default)]
+    pub attach: Vec<AttachTable>,
+    /// The cloth.
+    #[serde(default)]
+    pub material: MaterialTable,
+}
+
+/// One of `loop_near`, `near` with `within_m`, `vertices`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AttachTable {
+    /// The boundary loop nearest to this joint.
+    pub loop_near: Option<String>,
+    /// Vertices near this joint ...
+    pub near: Option<String>,
+    /// ... within so many metres.
+    pub within_m: Option<f32>,
+    /// Vertices of the file, from 0.
+    pub vertices: Option<Vec<u32>>,
+}
+
+/// [`Fabric`], all optional, same units.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MaterialTable {
+    density: Option<f32>,
+    stretch: Option<f32>,
+    shear: Option<f32>,
+    bend: Option<f32>,
+    friction: Option<f32>,
+    drag: Option<f32>,
+    damping_s: Option<f32>,
+    offset: Option<f32>,
+}
+
+/// [`ExplorationSettings`], all optional, the tolerance in millimetres.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExplorationTable {
+    velocity_time_s: Option<f32>,
+    tolerance_mm: Option<f32>,
+    depth_frames: Option<u32>,
+    round_jobs: Option<u32>,
+    publish_every_frames: Option<u64>,
+    drape_frames: Option<u32>,
+    rank_max: Option<u16>,
+    ground: Option<bool>,
+}
+
+/// Where a scene's transitions come from.
+#[derive(Debug, Clone, PartialEq)]
+pub enum MotionSource {
+    /// A JSON file, as written.
+    File(String),
+    /// All local minima below a distance [m].
+    Threshold(f32),
+    /// As few as bring the median time to reach a clip below this [s].
+    Reach(f32),
+}
+
+impl SceneFile {
+    /// Reads the TOML and checks every value that needs no other file.
+    ///
+    /// # Errors
+    /// Line and key of what is wrong, and what to do.
+    pub fn parse(text: &str) -> Result<Self, SceneFileError> {
+        let tables = text.lines().filter(|l| l.trim().starts_with("[garment]")).count();
+        if tables > 1 {
+            return Err(SceneFileError::Garments(tables));
+        }
+        let file: Self = toml::from_str(text)
+            .map_err(|e| SceneFileError::Toml(e.to_string().trim_end().to_owned()))?;
+        if let OneOrMany::Many(all) = &file.garment
+            && all.len() != 1
+        {
+            return Err(SceneFileError::Garments(all.len()));
+        }
+        in_range("fps", file.fps, FPS)?;
+        file.garment()?;
+        file.motion_source()?;
+        file.exploration()?;
+        Ok(file)
+    }
+
+    /// The garment.
+    ///
+    /// # Errors
+    /// An unknown or missing key, or a value out of range.
+    pub fn garment(&self) -> Result<GarmentTable, SceneFileError> {
+        let table = match &self.garment {
+            OneOrMany::One(table) => table.clone(),
+            OneOrMany::Many(all) => all.first().cloned().unwrap_or_default(),
+        };
+        let garment: GarmentTable = table
+            .try_into()
+            .map_err(|e: toml::de::Error| value("[garment]", e.to_string().trim_end()))?;
+        garment.fabric()?;
+        garment.attachments()?;
+        Ok(garment)
+    }
+
+    /// Where transitions come from.
+    ///
+    /// # Errors
+    /// None or several of the three keys, or a value out of range.
+    pub fn motion_source(&self) -> Result<MotionSource, SceneFileError> {
+        let table = &self.motion_graph;
+        match (&table.file, table.threshold_m, table.reach_s) {
+            (Some(file), None, None) => Ok(MotionSource::File(file.clone())),
+            (None, Some(threshold_m), None) => {
+                in_range("motion_graph.threshold_m", threshold_m, [1e-3, 10.0])?;
+                Ok(MotionSource::Threshold(threshold_m))
+            }
+            (None, None, Some(reach_s)) => {
+                in_range("motion_graph.reach_s", reach_s, [0.1, 1e4])?;
+                Ok(MotionSource::Reach(reach_s))
+            }
+            _ => Err(value("motion_graph", "give exactly one of file, threshold_m, reach_s")),
+        }
+    }
+
+    /// Exploration settings with defaults filled in.
+    ///
+    /// # Errors
+    /// A value out of range.
+    pub fn exploration(&self) -> Result<ExplorationSettings, SceneFileError> {
+        let (t, default) = (&self.exploration, ExplorationSettings::default());
+        if let Some(mm) = t.tolerance_mm {
+            in_range("exploration.tolerance_mm", mm, [0.0, 1e4])?;
+        }
+        if let Some(s) = t.velocity_time_s {
+            in_range("exploration.velocity_time_s", s, [0.0, 10.0])?;
+        }
+        let counts = [
+            ("depth_frames", t.depth_frames.map(u64::from)),
+            ("round_jobs", t.round_jobs.map(u64::from)),
+            ("publish_every_frames", t.publish_every_frames),
+            ("rank_max", t.rank_max.map(u64::from)),
+        ];
+        if let Some((key, _)) = counts.iter().find(|(_, count)| *count == Some(0)) {
+            return Err(value(&format!("exploration.{key}"), "must be at least 1"));
+        }
+        Ok(ExplorationSettings {
+            velocity_time_s: t.velocity_time_s.unwrap_or(default.velocity_time_s),
+            tolerance_m: t.tolerance_mm.map_or(default.tolerance_m, |mm| mm * 1e-3),
+            depth_frames: t.depth_frames.unwrap_or(default.depth_frames),
+            round_jobs: t.round_jobs.unwrap_or(default.round_jobs),
+            publish_every_frames: t.publish_every_frames.unwrap_or(default.publish_every_frames),
+            drape_frames: t.drape_frames.unwrap_or(default.drape_frames),
+            rank_max: t.rank_max.unwrap_or(default.rank_max),
+            ground: t.ground.unwrap_or(default.ground),
+        })
+    }
+}
+
+impl GarmentTable {
+    /// The material with defaults filled in.
+    ///
+    /// # Errors
+    /// A value out of range.
+    pub fn fabric(&self) -> Result<Fabric, SceneFileError> {
+        let (m, default) = (&self.material, Fabric::default());
+        let field = |key: &str, given: Option<f32>, default: f32, range: [f32; 2]| {
+            let number = given.unwrap_or(default);
+            in_range(&format!("garment.material.{key}"), number, range)?;
+            Ok::<f32, SceneFileError>(number)
+        };
+        Ok(Fabric {
+            density: field("density", m.density, default.density, [1e-3, 100.0])?,
+            stretch: field("stretch", m.stretch, default.stretch, [1e-3, 1e7])?,
+            shear: field("shear", m.shear, default.shear, [0.0, 1e7])?,
+            bend: field("bend", m.bend, default.bend, [0.0, 1.0])?,
+            friction: field("friction", m.friction, default.friction, [0.0, 10.0])?,
+            drag: field("drag", m.drag, default.drag, [0.0, 100.0])?,
+            damping_s: field("damping_s", m.damping_s, default.damping_s, [0.0, 1.0])?,
+            offset: field("offset", m.offset, default.offset, [0.0, 0.1])?,
+        })
+    }
+
+    /// Attachments, each of one kind.
+    ///
+    /// # Errors
+    /// None or several kinds in one entry.
+    pub fn attachments(&self) -> Result<Vec<Attachment>, SceneFileError> {
+        let one = |(index, a): (usize, &AttachTable)| match (
+            &a.loop_near,
+            &a.near,
+            a.within_m,
+            &a.vertices,
+        ) {
+            (Some(joint), None, None, None) => Ok(Attachment::Loop { joint: joint.clone() }),
+            (None, Some(joint), Some(within_m), None) => {
+                Ok(Attachment::Near { joint: joint.clone(), within_m })
+            }
+            (None, None, None, Some(v)) => Ok(Attachment::Vertices(v.clone())),
+            _ => Err(value(
+                &format!("garment.attach[{index}]"),
+                "give loop_near, or near with within_m, or vertices",
+            )),
+        };
+        self.attach.iter().enumerate().map(one).collect()
+    }
+}
+
+/// A path as written: relative to the scene's folder, or below the data folder.
+///
+/// # Errors
+/// `$TOILE_DATA` where no data folder is known.
+pub fn resolve_path(
+    key: &str,
+    written: &str,
+    folder: &Path,
+    data: Option<&Path>,
+) -> Result<PathBuf, SceneFileError> {
+    match written.strip_prefix("$TOILE_DATA") {
+        None => Ok(folder.join(written)),
+        Some(rest) => {
+            let data = data.ok_or_else(|| {
+                let text = "the data folder is not known; set TOILE_DATA to the folder that holds \
+                            character.glb";
+                value(key, text)
+            })?;
+            Ok(data.join(rest.trim_start_matches('/')))
+        }
+    }
+}
+
+fn default_fps() -> f32 {
+    30.0
+}
+
+fn value(key: &str, problem: &str) -> SceneFileError {
+    SceneFileError::Value { key: key.to_owned(), problem: problem.to_owned() }
+}
+
+fn in_range(key: &str, number: f32, [low, high]: [f32; 2]) -> Result<(), SceneFileError> {
+    if (low..=high).contains(&number) {
+        Ok(())
+    } else {
+        Err(value(key, &format!("{number} is out of range; give {low} to {high}")))
+    }
+}
