@@ -4,7 +4,7 @@
 //! - A mesh becomes a picture within some tens of milliseconds, without a graphics card.
 //! - Faults are to be seen: the back of a triangle has another hue than its front, a contact shadow
 //!   shows what floats, colours by vertex show strain or error.
-//! - Equal input, equal bytes, so that a picture can be a test.
+//! - Equal input, equal bytes (on one machine), so that a picture can be a test.
 //!
 //! # Non-goals
 //! - No files, threads, clocks or windows: every function returns values or bytes.

@@ -224,13 +224,14 @@ impl Samples {
     }
 
     fn cover_ground(&mut self, ground: &Ground) {
-        for y in 0..self.height {
-            for x in 0..self.width {
-                let nearness = ground.nearness(x as f32 + 0.5, y as f32 + 0.5);
-                let sample = (y * self.width + x) as usize;
-                if nearness > self.nearness[sample] {
-                    self.nearness[sample] = nearness;
-                    self.surface[sample] = GROUND;
+        let wide = self.width as usize;
+        let rows = self.nearness.chunks_mut(wide).zip(self.surface.chunks_mut(wide));
+        for (y, (depths, surfaces)) in rows.enumerate() {
+            let nearness = ground.nearness(y as f32 + 0.5);
+            for (depth, surface) in depths.iter_mut().zip(surfaces) {
+                if nearness > *depth {
+                    *depth = nearness;
+                    *surface = GROUND;
                 }
             }
         }

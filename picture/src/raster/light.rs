@@ -112,14 +112,15 @@ impl Ground {
         (x - self.middle.x) / self.focal * right - (y - self.middle.y) / self.focal * up - back
     }
 
-    /// 1/w of the ground at a point of the grid, in 1/metres; 0 or less above the horizon.
-    pub(super) fn nearness(&self, x: f32, y: f32) -> f32 {
-        self.ray(x, y).y / (self.height - self.eye.y)
+    /// 1/w of the ground in a row of the grid, in 1/metres; 0 or less above the horizon. It is the
+    /// same along a row, for the camera never tilts to a side.
+    pub(super) fn nearness(&self, y: f32) -> f32 {
+        self.ray(self.middle.x, y).y / (self.height - self.eye.y)
     }
 
     /// Linear light at a point of the grid.
     pub(super) fn shade(&self, x: f32, y: f32) -> Vec3 {
-        let nearness = self.nearness(x, y);
+        let nearness = self.nearness(y);
         if nearness <= 0.0 {
             return self.background;
         }
