@@ -6,6 +6,7 @@ use std::ops::Range;
 use cloth::{Pose, Rigid, Skeleton, Vec3};
 use protocol::PoseId;
 
+use super::clearance::Placed;
 use super::clips::{Cycle, FPS};
 use super::skeleton::joint;
 use crate::import::align;
@@ -46,13 +47,6 @@ const TRANSITIONS: [(&str, Range<usize>, &str, Range<usize>); 23] = [
 const HEEL: Vec3 = Vec3::new(0.0, -0.08, -0.03);
 const TIP: Vec3 = Vec3::new(0.0, -0.025, 0.06);
 
-/// A transition and the ring numbers of its ends.
-struct Link {
-    clips: [usize; 2],
-    from_frame: usize,
-    to_frame: usize,
-}
-
 /// Builds the graph; every pose can be reached from every other.
 ///
 /// # Errors
@@ -75,21 +69,11 @@ pub(super) fn primary_graph(
             edges.push(edge(first + frame, first + next, &moved));
         }
     }
-    for link in links(cycles, &tracks) {
-        let [from, to] = link.clips;
+    for link in links(skeleton, cycles, &unrolled, &tracks) {
+        let (from, to) = (link.from_clip, link.to_clip);
         let frames = cycles[to].poses.len();
-        let run = transition::run(
-            &unrolled,
-            &tracks,
-            &Transition {
-                from_clip: from,
-                from_frame: link.from_frame + cycles[from].poses.len(),
-                to_clip: to,
-                to_frame: link.to_frame + frames,
-                distance_m: 0.0,
-            },
-        );
-        let mut last = first_node[from] + link.from_frame;
+        let run = transition::run(&unrolled, &tracks, &link);
+        let mut last = first_node[from] + link.from_frame - cycles[from].poses.len();
         let mut moved = run.fit.alignment();
         for (step, pose) in run.poses.into_iter().enumerate() {
             edges.push(edge(last, poses.len(), &moved));
@@ -141,24 +125,43 @@ fn unroll(cycle: &Cycle) -> Clip {
     Clip { name: cycle.name.to_owned(), poses: rounds.iter().flat_map(round).collect() }
 }
 
-/// The best fit of each transition; of equals the earliest.
-fn links(cycles: &[Cycle], tracks: &[align::JointTrack]) -> Vec<Link> {
+/// Fits of one transition that are looked at, best first.
+const CANDIDATES: usize = 64;
+/// Gap between the legs that a transition shall keep [m].
+const LEGS_GAP_M: f32 = 0.012;
+
+/// The best fit of each transition in which the legs do not cross; the best of all where there is
+/// none. Of equals the earliest.
+fn links(
+    skeleton: &Skeleton,
+    cycles: &[Cycle],
+    unrolled: &[Clip],
+    tracks: &[align::JointTrack],
+) -> Vec<Transition> {
     let clip = |name: &str| cycles.iter().position(|cycle| cycle.name == name);
     let mut links = Vec::new();
     for (from_name, leave, to_name, enter) in TRANSITIONS {
-        let (Some(from), Some(to)) = (clip(from_name), clip(to_name)) else { continue };
-        let (rounds_from, rounds_to) = (cycles[from].poses.len(), cycles[to].poses.len());
-        let mut best = (f32::MAX, 0, 0);
-        for from_frame in leave {
-            let source = tracks[from].window(from_frame + rounds_from + 1);
-            for to_frame in enter.clone() {
-                let fit = align::fit(source, tracks[to].window(to_frame + rounds_to));
-                if fit.distance_m < best.0 {
-                    best = (fit.distance_m, from_frame, to_frame);
-                }
+        let (Some(from_clip), Some(to_clip)) = (clip(from_name), clip(to_name)) else { continue };
+        let (before_from, before_to) = (cycles[from_clip].poses.len(), cycles[to_clip].poses.len());
+        let mut fits = Vec::new();
+        for from_frame in leave.start + before_from..leave.end + before_from {
+            let source = tracks[from_clip].window(from_frame + 1);
+            for to_frame in enter.start + before_to..enter.end + before_to {
+                let distance_m = align::fit(source, tracks[to_clip].window(to_frame)).distance_m;
+                fits.push(Transition { from_clip, from_frame, to_clip, to_frame, distance_m });
             }
         }
-        links.push(Link { clips: [from, to], from_frame: best.1, to_frame: best.2 });
+        fits.sort_by(|a, b| a.distance_m.total_cmp(&b.distance_m));
+        let clear = |t: &&Transition| {
+            let poses = transition::run(unrolled, tracks, t).poses;
+            poses.iter().all(|pose| legs_gap_m(skeleton, pose) > LEGS_GAP_M)
+        };
+        links.extend(fits.iter().take(CANDIDATES).find(clear).or(fits.first()).copied());
     }
     links
+}
+
+fn legs_gap_m(skeleton: &Skeleton, pose: &Pose) -> f32 {
+    let left = [joint::SHIN, joint::FOOT, joint::TOES];
+    Placed::new(skeleton, pose).gap(&left, &left.map(|j| j + joint::SIDE))
 }

@@ -4,10 +4,11 @@
 //! bit on one machine.
 //!
 //! Map: `skeleton` joints; `figure` poses by inverse kinematics; `gait`, `curve`, `clips` motion;
-//! `graph` the primary graph; `field`, `surface`, `remesh` meshes from distance fields;
+//! `graph`, `clearance` the primary graph; `field`, `surface`, `remesh` meshes from distance fields;
 //! `character` the body; `garment` the robe.
 
 mod character;
+mod clearance;
 mod clips;
 mod curve;
 mod field;

@@ -3,6 +3,7 @@
 use cloth::{Rigid, Vec3};
 use protocol::EdgeId;
 
+use super::clearance::Placed;
 use super::skeleton::joint;
 use super::surface::Mesh;
 use super::*;
@@ -240,4 +241,22 @@ fn nearest_on_triangle(p: Vec3, a: Vec3, b: Vec3, c: Vec3) -> Vec3 {
     }
     let edges = [on_edge(a, b), on_edge(b, c), on_edge(c, a)];
     edges.into_iter().min_by(|x, y| p.distance(*x).total_cmp(&p.distance(*y))).unwrap()
+}
+
+#[test]
+fn limbs_keep_clear_of_the_body_and_of_each_other() {
+    let trunk = [joint::HIPS, joint::SPINE, joint::CHEST, joint::HEAD];
+    let arm = [joint::FOREARM, joint::HAND];
+    let leg = [joint::SHIN, joint::FOOT, joint::TOES];
+    let right = |left: &[usize]| left.iter().map(|j| j + joint::SIDE).collect::<Vec<_>>();
+    for (id, pose) in scene().primary.poses().iter().enumerate() {
+        let placed = Placed::new(&scene().body.skeleton, &pose.pose);
+        let at = format!("pose {id}, {} of clip {}", pose.frame, pose.clip);
+        for arm in [arm.to_vec(), right(&arm)] {
+            let gap = placed.gap(&arm, &trunk);
+            assert!(gap > 0.03, "arm {gap} m from the trunk, {at}");
+        }
+        let gap = placed.gap(&leg, &right(&leg));
+        assert!(gap > 0.01, "shins {gap} m apart, {at}");
+    }
 }
