@@ -1,1 +1,41 @@
-//! placeholder
+//! What a game links: cloth for its characters, streamed, cached, played and decoded.
+//!
+//! Goals: a face that an engine calls once a frame and that never blocks; no async type and no
+//! thread in that face; an answer for every frame, with its error stated; memory within a budget.
+//!
+//! Non-goals: exploring, publishing, rendering, deciding which pose comes next.
+//!
+//! Per character: [`Character::step`] once per tick of the scene, [`Character::sample`] once per
+//! frame of the screen, [`decode`] wherever the host wants the work done.
+//!
+//! Architecture invariants: nothing here waits for a lock or a socket on the caller's side, apart
+//! from functions that say so in their name (`wait_*`, `close`); the core knows no network, no
+//! file and no thread ([`walk`], a tool, reads its list from a file); neither explorer nor server is linked.
+//!
+//! Map: [`version`] a version assembled, [`cache`] decoded
+//! regions, [`shared`] how both reach the frame loop; [`character`] the face, [`blend`] and
+//! [`placement`] under it; [`prefetch`] what is needed next; [`telemetry`] and [`stats`] what was
+//! played; [`scene`] the checked scene, [`walk`] walks over it.
+
+#![cfg_attr(test, allow(clippy::float_cmp))] // exact values are meant
+
+pub mod blend;
+pub mod cache;
+pub mod character;
+pub mod clock;
+pub mod placement;
+pub mod prefetch;
+pub mod scene;
+pub mod shared;
+pub mod stats;
+pub mod telemetry;
+pub mod version;
+pub mod walk;
+
+#[cfg(test)]
+mod tiny;
+
+pub use character::{Character, StepOutcome, decode};
+pub use scene::Scene;
+pub use stats::{Histogram, PlayStats};
+pub use walk::{Walk, WalkSpec};

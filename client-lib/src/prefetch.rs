@@ -1,0 +1,204 @@
+//! What will be needed soon: the primary graph is followed ahead of each cursor, the likeliest
+//! ways first.
+//!
+//! A pure function of cursors, version and what is resident: equal inputs, equal wants.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BinaryHeap, HashSet};
+
+use protocol::manifest::ChunkRef;
+use protocol::{ChunkHash, EdgeId, StateId};
+
+use crate::cache::Resident;
+use crate::version::Version;
+
+/// How far to look ahead.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Horizon {
+    /// Frames ahead of each cursor. Default 75: two and a half seconds at 30 fps cover a slow
+    /// connection's round trips many times over.
+    pub frames: u32,
+    /// States followed per cursor: bounds the work. Default 2,000, well under a millisecond.
+    pub states_max: usize,
+    /// Ways less likely than this are not followed. Default 1/500.
+    pub probability_min: f32,
+}
+
+impl Default for Horizon {
+    fn default() -> Self {
+        Self { frames: 75, states_max: 2_000, probability_min: 0.002 }
+    }
+}
+
+/// How likely each edge is, relative to the others out of the same pose.
+#[derive(Debug, Clone, Default)]
+pub struct EdgeWeights(Vec<u32>);
+
+impl EdgeWeights {
+    /// Counts walked edges.
+    pub fn add(&mut self, edge: EdgeId, count: u32) {
+        if self.0.len() <= edge.index() {
+            self.0.resize(edge.index() + 1, 0);
+        }
+        self.0[edge.index()] = self.0[edge.index()].saturating_add(count);
+    }
+
+    /// One more than was counted, so that no edge is ruled out; uniform without counts.
+    fn weight(&self, edge: EdgeId) -> f32 {
+        self.0.get(edge.index()).map_or(1.0, |count| 1.0 + *count as f32)
+    }
+}
+
+/// A chunk that a cursor is about to need.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Want {
+    /// The chunk.
+    pub chunk: ChunkRef,
+    /// The soonest that a cursor can be there, in frames; 0 where one already stands.
+    pub frames: u32,
+    /// How likely one comes there on that way.
+    pub probability: f32,
+}
+
+/// A place ahead of a cursor. Ordered by probability, then nearness, then id.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Ahead {
+    /// Bits of a positive `f32`, which are in the order of the numbers.
+    probability: u32,
+    frames: Reverse<u32>,
+    state: Reverse<StateId>,
+}
+
+/// The chunks that are not resident and lie ahead, the most pressing first.
+pub fn wants(
+    version: &Version,
+    resident: &Resident,
+    cursors: &[StateId],
+    weights: &EdgeWeights,
+    horizon: &Horizon,
+) -> Vec<Want> {
+    let mut found = BTreeMap::new();
+    for cursor in cursors {
+        let search = Search { version, resident, weights, horizon, found: &mut found };
+        search.run(*cursor);
+    }
+    let mut wants: Vec<Want> = found.into_values().collect();
+    // An unlikely way may wait for as many frames longer as it is less likely.
+    let pressing = |want: &Want| (want.frames as f32 + 1.0) / want.probability;
+    wants.sort_by(|a, b| pressing(a).total_cmp(&pressing(b)).then(a.chunk.hash.cmp(&b.chunk.hash)));
+    wants
+}
+
+struct Search<'a> {
+    version: &'a Version,
+    resident: &'a Resident,
+    weights: &'a EdgeWeights,
+    horizon: &'a Horizon,
+    found: &'a mut BTreeMap<ChunkHash, Want>,
+}
+
+impl Search<'_> {
+    fn run(mut self, cursor: StateId) {
+        let Some(start) = self.version.links().resume(cursor) else { return };
+        let mut open = BinaryHeap::new();
+        let mut seen = HashSet::new();
+        open.push(Ahead { probability: 1f32.to_bits(), frames: Reverse(0), state: Reverse(start) });
+        while let Some(Ahead { probability, frames, state }) = open.pop() {
+            let (probability, frames, state) = (f32::from_bits(probability), frames.0, state.0);
+            if !seen.insert(state) {
+                continue;
+            }
+            if seen.len() > self.horizon.states_max {
+                break;
+            }
+            self.want(state, frames, probability);
+            if frames < self.horizon.frames {
+                self.look_on(&mut open, state, frames + 1, probability);
+            }
+        }
+    }
+
+    /// Opens the successors of a state.
+    fn look_on(
+        &mut self,
+        open: &mut BinaryHeap<Ahead>,
+        state: StateId,
+        frames: u32,
+        probability: f32,
+    ) {
+        let (scene, links) = (self.version.scene(), self.version.links());
+        let Some(pose) = links.pose(state) else { return };
+        let sum: f32 = scene.out_edges(pose).map(|edge| self.weights.weight(edge)).sum();
+        for (slot, edge) in scene.out_edges(pose).enumerate() {
+            let probability = probability * self.weights.weight(edge) / sum;
+            let Some(follow) = links.follow(state, slot) else { continue };
+            if probability < self.horizon.probability_min {
+                continue;
+            }
+            if let Some((dead_end, _)) = follow.via {
+                self.want(dead_end, frames, probability);
+            }
+            open.push(Ahead {
+                probability: probability.to_bits(),
+                frames: Reverse(frames),
+                state: Reverse(follow.state),
+            });
+        }
+    }
+
+    fn want(&mut self, state: StateId, frames: u32, probability: f32) {
+        if self.resident.has(state) {
+            return;
+        }
+        let Some(region) = self.version.region_chunk(state) else { return };
+        let chunk = region.chunk;
+        let want = Want { chunk, frames, probability };
+        let known = self.found.entry(chunk.hash).or_insert(want);
+        known.frames = known.frames.min(frames);
+        known.probability = known.probability.max(probability);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tiny;
+
+    #[test]
+    fn the_chunk_ahead_is_wanted_at_its_distance_and_nothing_that_is_resident() {
+        let version = tiny::version(2, tiny::grown_links());
+        let view = tiny::view(&version, &[0]);
+        let ask = |cursor: u64, weights: &EdgeWeights| {
+            wants(&version, &view.resident, &[StateId(cursor)], weights, &Horizon::default())
+        };
+        // From 0: edge 1 to state 1, then to 3 (resident), then to 4 or 5 in the second chunk.
+        let found = ask(0, &EdgeWeights::default());
+        assert_eq!(found.len(), 1);
+        assert_eq!(found[0].chunk.hash, tiny::region_chunk(1));
+        assert_eq!(found[0].frames, 3);
+        assert!((found[0].probability - 0.25).abs() < 1e-6, "{found:?}");
+        assert_eq!(ask(3, &EdgeWeights::default())[0].frames, 1);
+        // Players who always take edge 1 make it likelier.
+        let mut weights = EdgeWeights::default();
+        weights.add(EdgeId(1), 8);
+        assert!((ask(0, &weights)[0].probability - 0.9 * 0.9).abs() < 1e-6);
+        let all = tiny::view(&version, &[0, 1]);
+        let none = wants(&version, &all.resident, &[StateId(0)], &weights, &Horizon::default());
+        assert!(none.is_empty());
+    }
+
+    #[test]
+    fn equal_inputs_give_equal_wants() {
+        let version = tiny::version(2, tiny::grown_links());
+        let view = tiny::view(&version, &[]);
+        let cursors = [StateId(5), StateId(0), StateId(1_000_000)];
+        let ask = || {
+            let weights = EdgeWeights::default();
+            wants(&version, &view.resident, &cursors, &weights, &Horizon::default())
+        };
+        let first = ask();
+        assert_eq!(first.len(), 2, "a cursor that does not exist is ignored");
+        assert!((0..10).all(|_| ask() == first));
+        assert_eq!(first[0].frames, 0, "where a cursor stands comes first");
+    }
+}
