@@ -6,6 +6,8 @@ use crate::ids::{ChunkHash, VersionNumber};
 pub const CHUNKS: &str = "chunks";
 /// Folder of manifests.
 pub const VERSIONS: &str = "versions";
+/// The publisher's public key: 64 hexadecimal digits and a newline.
+pub const PUBLISHER: &str = "publisher.pub";
 /// Folder of telemetry batches.
 pub const TELEMETRY: &str = "telemetry";
 

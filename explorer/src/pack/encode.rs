@@ -67,6 +67,9 @@ pub enum EncodeError {
     /// Columns of a generation that depend on one another.
     #[error("generation {0} has columns that depend on one another")]
     Dependent(usize),
+    /// States without extent: every vertex is at the hips.
+    #[error("the states span nothing that a step of 300 micrometres can hold")]
+    Nothing,
     /// Not whole states of the basis' rows, none, or more than a region holds.
     #[error(
         "{numbers} numbers do not make 1 to {} states of {rows} rows",

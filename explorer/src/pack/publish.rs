@@ -1,0 +1,434 @@
+//! Publishing: a version appears atomically or not at all.
+//!
+//! Order of writes: chunks under their hashes first, which nobody sees; then the manifest under
+//! the next number, only if that number is free. A crash before the manifest leaves chunks that
+//! the next attempt finds; a crash after it leaves a version that the next attempt adopts.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use object_store::ObjectStore;
+use protocol::links::{LinkEntry, LinkPage};
+use protocol::manifest::{ChunkRef, GarmentVersion, GenerationRef, VersionStats};
+use protocol::scene::Edge;
+use protocol::{
+    ChunkHash, DecodeError, GarmentId, LinkTable, Manifest, NotTotal, PublisherKey, SigningKey,
+    VersionNumber,
+};
+
+use super::encode::{EncodeError, EncodeSettings, Encoder};
+use super::regions::{self, Cut, Encoding, NewRegions, RunsError};
+use super::scene_chunk::{garment_chunk, scene_chunk};
+use super::store::{self, NewChunks, StoreError};
+use crate::scene::Scene;
+use crate::view::GraphView;
+
+/// Why nothing was published; the head is as it was.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PublishError {
+    /// The store failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The scene breaks a limit, or a figure is impossible.
+    #[error("cannot be published: {0}")]
+    Invalid(#[from] DecodeError),
+    /// From some state, some edge leads nowhere.
+    #[error("the graph is not total: {0}")]
+    NotTotal(#[from] NotTotal),
+    /// The graph's runs are not those of the store.
+    #[error(transparent)]
+    Runs(#[from] RunsError),
+    /// States cannot be encoded.
+    #[error("encoding: {0}")]
+    Encode(#[from] EncodeError),
+    /// The store belongs to another key.
+    #[error("the store belongs to publisher {found}, but this key is {ours}")]
+    OtherPublisher {
+        /// Whose it is.
+        found: PublisherKey,
+        /// Ours.
+        ours: PublisherKey,
+    },
+    /// The store holds a garment of this name in another scene, mesh or codec.
+    #[error(
+        "the store holds another {what} for garment {garment:?}; publish to an empty store, or \
+         name the garment differently"
+    )]
+    OtherScene {
+        /// Name of the garment.
+        garment: String,
+        /// What differs.
+        what: &'static str,
+    },
+    /// States of another mesh.
+    #[error("states of {view} vertices, but the garment has {garment}")]
+    Vertices {
+        /// Vertices of the view's states.
+        view: usize,
+        /// Vertices of the scene's garment.
+        garment: usize,
+    },
+    /// Someone else published at the same time.
+    #[error("version {0} was created by another publisher of this store; open the store again")]
+    Conflict(VersionNumber),
+}
+
+/// Publishes the versions of one garment.
+pub struct Publisher {
+    store: Arc<dyn ObjectStore>,
+    key: SigningKey,
+    settings: EncodeSettings,
+    scene: Fixed,
+    head: Option<Manifest>,
+    encoder: Encoder,
+    /// Largest error of the garment's first version [m].
+    first_error_m: Option<f32>,
+}
+
+/// What never changes.
+struct Fixed {
+    name: String,
+    vertex_count: usize,
+    pose_count: usize,
+    edges: Vec<Edge>,
+    scene: Vec<u8>,
+    mesh: Vec<u8>,
+}
+
+/// A version that is ready, but not yet visible.
+pub struct Prepared {
+    manifest: Manifest,
+    /// `None` when the head says the same already.
+    new: Option<New>,
+}
+
+struct New {
+    chunks: NewChunks,
+    encoder: Encoder,
+    encoded_states: u64,
+}
+
+/// What publishing did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Published {
+    /// The head now.
+    pub number: VersionNumber,
+    /// Its manifest.
+    pub manifest: Manifest,
+    /// Whether a version was made; `false` when the head said the same already.
+    pub created: bool,
+    /// Chunks that no earlier version lists.
+    pub new_chunks: usize,
+    /// Their bytes.
+    pub new_bytes: u64,
+    /// States encoded.
+    pub encoded_states: u64,
+}
+
+impl Publisher {
+    /// Opens a store for publishing this scene's garment, and recovers everything from its head:
+    /// which states are covered, the basis, the codec's figures.
+    ///
+    /// # Errors
+    /// The store fails, belongs to another key, or holds another scene under the garment's name.
+    pub async fn open(
+        store: Arc<dyn ObjectStore>,
+        scene: &Scene,
+        key: SigningKey,
+        settings: EncodeSettings,
+    ) -> Result<Self, PublishError> {
+        let scene = Fixed::new(scene)?;
+        claim(&*store, &key).await?;
+        let encoder = Encoder::new();
+        let mut publisher =
+            Self { store, key, settings, scene, head: None, encoder, first_error_m: None };
+        if let Some(number) = store::head_number(&*publisher.store).await? {
+            publisher.recover(number).await?;
+        }
+        Ok(publisher)
+    }
+
+    /// The newest version, if there is one.
+    pub fn head(&self) -> Option<&Manifest> {
+        self.head.as_ref()
+    }
+
+    /// Prepares and commits. The future is not `Send` where the view is not `Sync`; then call
+    /// [`Publisher::prepare`] and [`Publisher::commit`].
+    ///
+    /// # Errors
+    /// Nothing was published; the head is as it was.
+    pub async fn publish(&mut self, view: &dyn GraphView) -> Result<Published, PublishError> {
+        let prepared = self.prepare(view)?;
+        self.commit(prepared).await
+    }
+
+    /// Checks totality and encodes what is new. Touches no store and changes nothing; takes CPU
+    /// time (of the order of a millisecond a new state, more for the first version).
+    ///
+    /// # Errors
+    /// The view is not total, not of this scene, or cannot be encoded.
+    pub fn prepare(&self, view: &dyn GraphView) -> Result<Prepared, PublishError> {
+        let (found, expected) = (view.vertex_count(), self.scene.vertex_count);
+        if found != expected {
+            return Err(PublishError::Vertices { view: found, garment: expected });
+        }
+        let links = view.links();
+        let pages = self.total(&links)?;
+        let before = self.garment();
+        let covered = before.map_or(0, covered);
+        let cuts = regions::cut(view.runs(), covered, links.len() as u64)?;
+        let encoding = Encoding {
+            view,
+            settings: &self.settings,
+            generations: before.map_or(0, |garment| garment.generations.len()),
+            outside_m: self.outside_m(),
+        };
+        let new = encoding.encode(&self.encoder, &cuts)?;
+        let mut chunks = NewChunks::default();
+        let encoder = new.encoder.clone();
+        let garment = self.version(view.stats(), &cuts, new, &pages, &mut chunks);
+        if let Some(head) = self.head.as_ref().filter(|_| before == Some(&garment)) {
+            return Ok(Prepared { manifest: head.clone(), new: None });
+        }
+        let manifest = self.next(garment);
+        manifest.check()?;
+        let listed = self.head.iter().flat_map(|head| &head.garments);
+        let listed: BTreeSet<ChunkHash> =
+            listed.flat_map(|garment| garment.chunks()).map(|chunk| chunk.hash).collect();
+        chunks.chunks.retain(|hash, _| !listed.contains(hash));
+        let encoded_states = cuts.iter().map(|cut| u64::from(cut.count)).sum();
+        Ok(Prepared { manifest, new: Some(New { chunks, encoder, encoded_states }) })
+    }
+
+    /// Makes a prepared version visible: chunks first, then its manifest in one atomic step.
+    ///
+    /// # Errors
+    /// The store refused a write, or another publisher was faster. The head is as it was.
+    pub async fn commit(&mut self, prepared: Prepared) -> Result<Published, PublishError> {
+        let Prepared { manifest, new } = prepared;
+        let number = manifest.number;
+        let Some(New { chunks, encoder, encoded_states }) = new else {
+            let (new_chunks, new_bytes, encoded_states) = (0, 0, 0);
+            let created = false;
+            return Ok(Published {
+                number,
+                manifest,
+                created,
+                new_chunks,
+                new_bytes,
+                encoded_states,
+            });
+        };
+        if self.next_number() != number {
+            return Err(PublishError::Conflict(number));
+        }
+        for (hash, bytes) in &chunks.chunks {
+            put_chunk(&*self.store, hash, bytes).await?;
+        }
+        let signed = manifest.clone().sign(&self.key).encode();
+        let path = protocol::store::version_path(number);
+        if !store::create(&*self.store, &path, signed).await? {
+            let there = store::version(&*self.store, number, &self.key.public()).await?;
+            if there.manifest.encode() != manifest.encode() {
+                return Err(PublishError::Conflict(number));
+            }
+        }
+        let (new_chunks, new_bytes) = (chunks.chunks.len(), chunks.bytes());
+        self.encoder = encoder;
+        let first = manifest.garment(&self.scene.name).map(|g| g.stats.codec_max_error_m);
+        self.first_error_m = self.first_error_m.or(first);
+        self.head = Some(manifest.clone());
+        Ok(Published { number, manifest, created: true, new_chunks, new_bytes, encoded_states })
+    }
+
+    fn garment(&self) -> Option<&GarmentVersion> {
+        self.head.as_ref()?.garment(&self.scene.name)
+    }
+
+    fn next_number(&self) -> VersionNumber {
+        VersionNumber(self.head.as_ref().map_or(1, |head| head.number.0 + 1))
+    }
+
+    /// From which error on a region falls outside the basis [m].
+    fn outside_m(&self) -> f32 {
+        let settings = &self.settings;
+        self.first_error_m.map_or(f32::INFINITY, |first| {
+            (settings.error_factor * first).max(settings.error_floor_m)
+        })
+    }
+
+    /// The link pages, proved total.
+    fn total(&self, links: &[LinkEntry]) -> Result<Vec<LinkPage>, PublishError> {
+        let pages = LinkPage::split(links);
+        pages.iter().try_for_each(LinkPage::check)?;
+        LinkTable::new(&pages, self.scene.pose_count, &self.scene.edges)?;
+        Ok(pages)
+    }
+
+    /// The garment's part of the next manifest; its chunks go to `chunks`.
+    fn version(
+        &self,
+        stats: VersionStats,
+        cuts: &[Cut],
+        new: NewRegions,
+        pages: &[LinkPage],
+        chunks: &mut NewChunks,
+    ) -> GarmentVersion {
+        let before = self.garment();
+        let stats = self.with_codec_figures(stats, cuts, &new);
+        let mut generations = before.map_or(Vec::new(), |garment| garment.generations.clone());
+        if let Some((bytes, columns)) = new.generation {
+            generations.push(GenerationRef { chunk: chunks.add(bytes), columns });
+        }
+        let mut covered = before.map_or(Vec::new(), |garment| garment.regions.clone());
+        covered.extend(regions::bundle(cuts, new.regions, chunks));
+        GarmentVersion {
+            id: before.map_or_else(|| self.free_id(), |garment| garment.id),
+            name: self.scene.name.clone(),
+            codec: codec::kim2013::PROFILE.into(),
+            scene: chunks.add(self.scene.scene.clone()),
+            mesh: chunks.add(self.scene.mesh.clone()),
+            generations,
+            regions: covered,
+            links: pages.iter().map(|page| chunks.add(page.encode())).collect(),
+            stats,
+        }
+    }
+
+    /// Maximum and RMS go on from the figures of the head as they stand there, so that a resumed
+    /// publisher writes what an uninterrupted one writes.
+    fn with_codec_figures(
+        &self,
+        stats: VersionStats,
+        cuts: &[Cut],
+        new: &NewRegions,
+    ) -> VersionStats {
+        let before = self.garment().map_or_else(VersionStats::default, |garment| garment.stats);
+        let old_states = self.garment().map_or(0, covered);
+        let vertices = self.scene.vertex_count as f64;
+        let new_states: u64 = cuts.iter().map(|cut| u64::from(cut.count)).sum();
+        let old_squares =
+            f64::from(before.codec_rms_error_m).powi(2) * old_states as f64 * vertices;
+        let all = (old_states + new_states).max(1) as f64 * vertices;
+        let rms = ((old_squares + new.square_sum_m2()) / all).sqrt() as f32;
+        VersionStats {
+            codec_max_error_m: before.codec_max_error_m.max(new.max_error_m()),
+            codec_rms_error_m: if new_states == 0 { before.codec_rms_error_m } else { rms },
+            raw_bytes: stats.states * 12 * self.scene.vertex_count as u64,
+            ..stats
+        }
+    }
+
+    fn free_id(&self) -> GarmentId {
+        let last = self.head.as_ref().and_then(|head| head.garments.last());
+        GarmentId(last.map_or(0, |garment| garment.id.0 + 1))
+    }
+
+    /// The head with this garment in it and the next number on it.
+    fn next(&self, garment: GarmentVersion) -> Manifest {
+        let mut garments = self.head.as_ref().map_or(Vec::new(), |head| head.garments.clone());
+        match garments.iter_mut().find(|known| known.id == garment.id) {
+            Some(known) => *known = garment,
+            None => garments.push(garment),
+        }
+        let previous = self.head.as_ref().map(Manifest::hash);
+        Manifest { number: self.next_number(), previous, garments }
+    }
+
+    async fn recover(&mut self, number: VersionNumber) -> Result<(), PublishError> {
+        let publisher = self.key.public();
+        let head = store::version(&*self.store, number, &publisher).await?.manifest;
+        if let Some(garment) = head.garment(&self.scene.name) {
+            self.scene.check_same(garment)?;
+            for generation in &garment.generations {
+                let bytes = store::chunk(&*self.store, &generation.chunk).await?;
+                self.encoder.append(&bytes)?;
+            }
+            self.first_error_m = Some(self.first_error(number).await?);
+        }
+        self.head = Some(head);
+        Ok(())
+    }
+
+    /// Largest error of the first version that has the garment.
+    async fn first_error(&self, head: VersionNumber) -> Result<f32, PublishError> {
+        for number in (1..=head.0).map(VersionNumber) {
+            match store::version(&*self.store, number, &self.key.public()).await {
+                Ok(version) => {
+                    if let Some(garment) = version.manifest.garment(&self.scene.name) {
+                        return Ok(garment.stats.codec_max_error_m);
+                    }
+                }
+                Err(StoreError::NoVersion(_)) => {} // old versions may be thinned out
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Err(StoreError::NoVersion(head).into())
+    }
+}
+
+impl Fixed {
+    fn new(scene: &Scene) -> Result<Self, PublishError> {
+        let chunk = scene_chunk(scene);
+        let mesh = garment_chunk(scene);
+        chunk.check()?;
+        mesh.check()?;
+        Ok(Self {
+            name: scene.garment.name.clone(),
+            vertex_count: scene.garment.positions.len(),
+            pose_count: chunk.poses.len(),
+            scene: chunk.encode(),
+            mesh: mesh.encode(),
+            edges: chunk.edges,
+        })
+    }
+
+    fn check_same(&self, garment: &GarmentVersion) -> Result<(), PublishError> {
+        let same = |chunk: &ChunkRef, bytes: &[u8]| chunk.hash == ChunkHash::of(bytes);
+        let what = if !same(&garment.scene, &self.scene) {
+            "scene"
+        } else if !same(&garment.mesh, &self.mesh) {
+            "mesh"
+        } else if garment.codec != codec::kim2013::PROFILE {
+            "codec"
+        } else {
+            return Ok(());
+        };
+        Err(PublishError::OtherScene { garment: self.name.clone(), what })
+    }
+}
+
+/// States covered by the region chunks: a prefix, since ids are given in order of creation.
+fn covered(garment: &GarmentVersion) -> u64 {
+    garment.regions.last().map_or(0, |last| last.first_state.0 + u64::from(last.state_count))
+}
+
+/// Puts the public key into an empty store; refuses one that belongs to another key.
+async fn claim(store: &dyn ObjectStore, key: &SigningKey) -> Result<(), PublishError> {
+    let ours = key.public();
+    let text = format!("{ours}\n");
+    if store::create(store, protocol::store::PUBLISHER, text).await? {
+        return Ok(());
+    }
+    match store::publisher(store).await? {
+        Some(found) if found != ours => Err(PublishError::OtherPublisher { found, ours }),
+        _ => Ok(()),
+    }
+}
+
+/// A chunk that is there already (from an attempt that crashed) is checked.
+async fn put_chunk(
+    store: &dyn ObjectStore,
+    hash: &ChunkHash,
+    bytes: &Bytes,
+) -> Result<(), StoreError> {
+    let path = protocol::store::chunk_path(hash);
+    if store::create(store, &path, bytes.clone()).await? {
+        return Ok(());
+    }
+    let chunk = ChunkRef { hash: *hash, bytes: bytes.len() as u32 };
+    store::chunk(store, &chunk).await.map(|_| ())
+}
