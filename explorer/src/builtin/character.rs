@@ -2,7 +2,7 @@
 
 use cloth::{Body, Skeleton, Vec3};
 
-use super::field::{RoundCone, union};
+use super::field::{RoundCone, Union};
 use super::remesh::{INSIDE, Target, remesh};
 use super::skeleton::{joint, skeleton};
 use super::surface::{Grid, Mesh, directed_edges, surface_nets};
@@ -79,7 +79,8 @@ pub(super) fn cones() -> Vec<RoundCone> {
 /// The mesh is not closed.
 pub(super) fn body() -> Result<Body, BuiltinError> {
     let cones = cones();
-    let surface = |p: Vec3| union(&cones, FILLET_M, p);
+    let skin = Union::new(&cones, FILLET_M);
+    let surface = |p: Vec3| skin.distance(p);
     let grid =
         Grid { low: Vec3::new(-0.72, -0.05, -0.22), high: Vec3::new(0.72, 1.76, 0.25), cell: 0.02 };
     let mut mesh = surface_nets(&surface, grid);

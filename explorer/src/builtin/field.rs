@@ -46,24 +46,45 @@ pub(super) fn join(a: f32, b: f32, k: f32) -> f32 {
     a.min(b) - h * h * k * 0.25
 }
 
-/// Union of many cones. A cone whose bounding ball is further than any fillet reaches is passed
-/// over, which changes nothing but the time it takes.
-pub(super) fn union(cones: &[RoundCone], k: f32, p: Vec3) -> f32 {
-    cones.iter().fold(f32::MAX, |sum, cone| {
-        let (middle, reach) = cone.ball();
-        let far = sum + k + reach;
-        if far > 0.0 && p.distance_squared(middle) > far * far {
-            return sum;
-        }
-        join(sum, cone.distance(p), k)
-    })
+/// Union of many cones with a fillet of `fillet_m`.
+pub(super) struct Union {
+    /// Each with a ball that holds it.
+    cones: Vec<(RoundCone, Vec3, f32)>,
+    fillet_m: f32,
 }
 
-/// Central differences over half a millimetre.
+impl Union {
+    pub fn new(cones: &[RoundCone], fillet_m: f32) -> Self {
+        let with_ball = |cone: &RoundCone| {
+            let (middle, reach) = cone.ball();
+            (*cone, middle, reach)
+        };
+        Self { cones: cones.iter().map(with_ball).collect(), fillet_m }
+    }
+
+    /// Distance of `p` [m]; a few millimetres too small inside fillets. A cone whose ball is
+    /// further than any fillet reaches is passed over, which changes nothing but the time.
+    pub fn distance(&self, p: Vec3) -> f32 {
+        self.cones.iter().fold(f32::MAX, |sum, (cone, middle, reach)| {
+            let far = sum + self.fillet_m + reach;
+            if far > 0.0 && p.distance_squared(*middle) > far * far {
+                return sum;
+            }
+            join(sum, cone.distance(p), self.fillet_m)
+        })
+    }
+}
+
+/// Slope of a field, from its values at the corners of a tetrahedron half a millimetre around.
 pub(super) fn gradient(field: &dyn Fn(Vec3) -> f32, p: Vec3) -> Vec3 {
     const H: f32 = 5e-4;
-    let along = |axis: Vec3| (field(p + axis * H) - field(p - axis * H)) / (2.0 * H);
-    Vec3::new(along(Vec3::X), along(Vec3::Y), along(Vec3::Z))
+    const CORNERS: [Vec3; 4] = [
+        Vec3::new(1.0, 1.0, 1.0),
+        Vec3::new(1.0, -1.0, -1.0),
+        Vec3::new(-1.0, 1.0, -1.0),
+        Vec3::new(-1.0, -1.0, 1.0),
+    ];
+    CORNERS.iter().map(|corner| *corner * field(p + *corner * H)).sum::<Vec3>() / (4.0 * H)
 }
 
 /// Moves `p` onto the zero set by at most four Newton steps.

@@ -3,7 +3,7 @@
 use cloth::{Body, Vec3};
 
 use super::character;
-use super::field::{RoundCone, join, union};
+use super::field::{RoundCone, Union, join};
 use super::remesh::{INSIDE, Target, remesh, settle};
 use super::surface::{Grid, Mesh, directed_edges, surface_nets};
 use super::{BuiltinError, check};
@@ -77,13 +77,13 @@ pub(super) fn robe(body: &Body) -> Result<Garment, BuiltinError> {
 
 /// The closed surface from which the robe is cut.
 struct Shell {
-    close: Vec<RoundCone>,
-    loose: Vec<RoundCone>,
+    close: Union,
+    loose: Union,
 }
 
 impl Shell {
     fn new() -> Self {
-        let close = character::cones().iter().map(|c| c.inflated(EASE_M)).collect();
+        let close: Vec<_> = character::cones().iter().map(|c| c.inflated(EASE_M)).collect();
         let mut loose = Vec::new();
         for (mirrored, (a, b, radius_a, radius_b)) in
             [(true, SLEEVE), (true, SKIRT), (false, HOOD[0]), (false, HOOD[1])]
@@ -95,12 +95,11 @@ impl Shell {
                 loose.push(RoundCone { joint: 0, a: a * flip, b: b * flip, radius_a, radius_b });
             }
         }
-        Self { close, loose }
+        Self { close: Union::new(&close, character::FILLET_M), loose: Union::new(&loose, FILLET_M) }
     }
 
     fn distance(&self, p: Vec3) -> f32 {
-        let close = union(&self.close, character::FILLET_M, p);
-        join(close, union(&self.loose, FILLET_M, p), FILLET_M)
+        join(self.close.distance(p), self.loose.distance(p), FILLET_M)
     }
 }
 

@@ -68,6 +68,8 @@ fn skin_weights_sum_to_one_and_hold_the_rest_pose() {
 fn the_robe_is_one_piece_with_four_openings() {
     let mesh = robe_mesh();
     assert_eq!(mesh.boundary_loops(), Ok(4));
+    let simulated = cloth::mesh::Mesh::new(mesh.positions.clone(), mesh.triangles.clone());
+    assert!(simulated.is_ok(), "{simulated:?}");
     assert!((3000..3400).contains(&mesh.positions.len()), "{}", mesh.positions.len());
     // A sphere with four holes: Euler's number is 2 - 4.
     let halves = 3 * mesh.triangles.len() + mesh.boundary().unwrap().len();
