@@ -205,19 +205,20 @@ impl Samples {
 
     fn cover(&mut self, index: u32, triangle: &Triangle) {
         let [columns, rows] = triangle.extent(self.width, self.height);
+        if columns.is_empty() {
+            return;
+        }
+        let [na, nb, nc] = triangle.nearness;
         for y in rows {
             let row = (y * self.width) as usize;
-            for x in columns.clone() {
+            let span = row + columns.start as usize..row + columns.end as usize;
+            let depths = self.nearness[span.clone()].iter_mut().zip(&mut self.surface[span]);
+            for (x, (depth, surface)) in columns.clone().zip(depths) {
                 let [a, b, c] = triangle.barycentric(x as f32 + 0.5, y as f32 + 0.5);
-                if a < 0.0 || b < 0.0 || c < 0.0 {
-                    continue;
-                }
-                let [na, nb, nc] = triangle.nearness;
                 let nearness = a * na + b * nb + c * nc;
-                let sample = row + x as usize;
-                if nearness > self.nearness[sample] {
-                    self.nearness[sample] = nearness;
-                    self.surface[sample] = index;
+                if a.min(b).min(c) >= 0.0 && nearness > *depth {
+                    *depth = nearness;
+                    *surface = index;
                 }
             }
         }
@@ -255,6 +256,12 @@ impl Shader<'_> {
             let at = |k: usize| samples.surface[(y + k / 2) * wide + x + k % 2];
             let surfaces = [at(0), at(1), at(2), at(3)];
             if surfaces == [NOTHING; 4] {
+                continue;
+            }
+            // Most pixels lie within one surface.
+            if surfaces == [surfaces[0]; 4] {
+                let light = self.shade(surfaces[0], x as f32 + 1.0, y as f32 + 1.0);
+                *pixel = light::encode(light);
                 continue;
             }
             let mut sum = Vec3::ZERO;

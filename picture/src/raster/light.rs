@@ -29,7 +29,8 @@ pub(super) fn encode(light: Vec3) -> Rgb {
 pub(super) struct Lights {
     key: Vec3,
     fill: Vec3,
-    back: Vec3,
+    /// Half way between the key light and the eye: where a surface gleams.
+    gleam: Vec3,
 }
 
 impl Lights {
@@ -40,7 +41,7 @@ impl Lights {
         let key = view.key.and_then(Vec3::try_normalize).unwrap_or(usual.normalize());
         // The fill comes from where the viewer is, moved to the side that the key leaves dark.
         let fill = (back - 0.6 * key.dot(right) * right).normalize_or_zero();
-        Self { key, fill, back }
+        Self { key, fill, gleam: (key + back).normalize_or_zero() }
     }
 
     /// Light from a surface; `normal` points out of its front.
@@ -54,7 +55,7 @@ impl Lights {
         let ambient = 0.20 + 0.16 * sky;
         let key = 0.78 * normal.dot(self.key).max(0.0);
         let fill = 0.22 * normal.dot(self.fill).max(0.0);
-        let gleam = (self.key + self.back).normalize_or_zero().dot(normal).max(0.0).powi(24);
+        let gleam = normal.dot(self.gleam).max(0.0).powi(24);
         colour * (ambient + key + fill) + Vec3::splat(0.05 * gleam)
     }
 }
