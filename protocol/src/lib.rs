@@ -8,7 +8,8 @@
 //! Map: [`ids`]; [`limits`]; [`scene`] the scene and garment chunks; [`region`] the container of
 //! encoded regions; [`links`] which state follows which, [`table`] all of it, proved total;
 //! [`manifest`] a version, [`difference`] what changed since another, [`sign`] who published it;
-//! [`store`] where things lie in an object store.
+//! [`store`] where things lie in an object store; [`message`] what is said on a connection and
+//! [`frame`] how it is cut; [`session`] the two sides of the conversation.
 //!
 //! ```
 //! use protocol::{ChunkHash, scene::GarmentChunk};
@@ -22,12 +23,15 @@
 //! ```
 
 pub mod difference;
+pub mod frame;
 pub mod ids;
 pub mod limits;
 pub mod links;
 pub mod manifest;
+pub mod message;
 pub mod region;
 pub mod scene;
+pub mod session;
 pub mod sign;
 pub mod store;
 pub mod table;

@@ -35,3 +35,32 @@ pub const LINK_PAGE_STATES: usize = 256;
 pub const MANIFEST_ENTRIES_MAX: usize = 1 << 19;
 /// Basis generations of a garment.
 pub const GENERATIONS_MAX: usize = 64;
+/// Bytes of a token.
+pub const TOKEN_BYTES_MAX: usize = 1024;
+/// Bytes of the sentence in a close message.
+pub const REASON_BYTES_MAX: usize = 1024;
+/// Edges in one telemetry message; a client splits what is longer.
+pub const TELEMETRY_EDGES_MAX: usize = 4096;
+/// Traversals per second that one client adds to the counts; what is above is dropped, so that
+/// nobody steers the exploration alone. Eight characters at 30 frames per second.
+pub const TRAVERSALS_PER_SECOND_MAX: u32 = 240;
+/// Traversals that a client may save up while it is silent.
+pub const TRAVERSALS_BURST_MAX: u32 = 60 * TRAVERSALS_PER_SECOND_MAX;
+/// Messages per second that a server accepts from one client; a client keeps to half of it.
+pub const MESSAGES_PER_SECOND_MAX: u32 = 4000;
+/// Fetches under way that a server accepts from one client.
+pub const FETCHES_MAX: usize = 256;
+/// Fetches under way that a client asks for: it leaves room for re-requests that cross answers.
+pub const CLIENT_FETCHES_MAX: usize = 64;
+/// Bytes under way at which a client asks for no more.
+pub const CLIENT_FETCH_BYTES_MAX: u64 = 16 << 20;
+/// Chunks that a client may want at once.
+pub const WANTS_MAX: usize = 1 << 17;
+/// Messages that wait for the link on either side.
+pub const OUTBOX_MAX: usize = 4096;
+/// Time from connecting to hello and from hello to welcome, in microseconds.
+pub const HANDSHAKE_US_MAX: u64 = 10_000_000;
+/// First delay before reconnecting, in microseconds; it doubles with every failure.
+pub const RECONNECT_US_MIN: u64 = 100_000;
+/// Longest delay before reconnecting, in microseconds.
+pub const RECONNECT_US_MAX: u64 = 5_000_000;

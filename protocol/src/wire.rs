@@ -104,17 +104,25 @@ impl Format {
             let known = self.version;
             return Err(DecodeError::UnknownVersion { what, found: version, known });
         }
-        let (value, rest) = postcard::take_from_bytes(&bytes[HEADER_BYTES..])
-            .map_err(|_| DecodeError::Malformed { what, bytes: bytes.len() })?;
-        if !rest.is_empty() {
-            return Err(DecodeError::Trailing { what, bytes: rest.len() });
-        }
-        Ok(value)
+        parse(what, &bytes[HEADER_BYTES..])
     }
 
     pub(crate) fn invalid(&self, why: String) -> DecodeError {
         DecodeError::Invalid { what: self.what, why }
     }
+}
+
+/// Postcard and nothing after it.
+pub(crate) fn parse<'a, T: Deserialize<'a>>(
+    what: &'static str,
+    bytes: &'a [u8],
+) -> Result<T, DecodeError> {
+    let (value, rest) = postcard::take_from_bytes(bytes)
+        .map_err(|_| DecodeError::Malformed { what, bytes: bytes.len() })?;
+    if !rest.is_empty() {
+        return Err(DecodeError::Trailing { what, bytes: rest.len() });
+    }
+    Ok(value)
 }
 
 /// `Err(why)` unless `condition`; keeps semantic checks readable.

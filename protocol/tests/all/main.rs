@@ -1,5 +1,7 @@
 //! Tests of everything that travels and everything that is stored.
 
 mod formats;
+mod link;
 mod samples;
+mod sessions;
 mod versions;

@@ -1,0 +1,615 @@
+//! The client's side.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use super::wants::{Change, Wants};
+use super::{Allowance, Time};
+use crate::difference::{ApplyError, ManifestDifference};
+use crate::frame::{CHUNK_HEAD_BYTES, FrameDecoder, FrameTooLong, frame, parse_chunk_head};
+use crate::ids::{ChunkHash, VersionNumber};
+use crate::limits;
+use crate::manifest::{ChunkRef, ManifestError, SignedManifest};
+use crate::message::{
+    ClientMessage, CloseCode, Have, Hello, PROTOCOL, Priority, ServerMessage, Telemetry,
+};
+use crate::sign::PublisherKey;
+use crate::wire::DecodeError;
+
+/// How a client introduces itself.
+#[derive(Debug, Clone, Default)]
+pub struct ClientConfig {
+    /// Shown to the server.
+    pub token: Option<String>,
+    /// Garments that it plays, by name; none: all.
+    pub garments: Vec<String>,
+    /// The only publisher whose manifests are accepted. `None` trusts the first that the server
+    /// names, and from then on no other.
+    pub publisher: Option<PublisherKey>,
+    /// Spreads the reconnections of many clients; any number that differs between them.
+    pub jitter_seed: u64,
+}
+
+/// What the driver has to do, or hand to the player.
+#[derive(Debug, Clone, PartialEq)]
+pub enum ClientEvent {
+    /// Dial the server now: answer by [`Client::handle_connected`] or
+    /// [`Client::handle_disconnected`]. Any earlier connection must be gone.
+    Connect,
+    /// The server has let us in.
+    Welcome,
+    /// A new version: verified, newer than the one before.
+    Version(Arc<SignedManifest>),
+    /// A chunk that was wanted; its bytes are what its hash says.
+    Chunk {
+        /// Its name.
+        hash: ChunkHash,
+        /// Its bytes.
+        bytes: Vec<u8>,
+    },
+    /// The server does not have this chunk. It is no longer wanted.
+    Missing {
+        /// Its name.
+        hash: ChunkHash,
+    },
+    /// Close the connection (with this code) if it is still there. Unless the reason
+    /// [is final](SessionError::is_final), a `Connect` follows after a while, and everything that
+    /// is still wanted is asked for again.
+    Disconnect {
+        /// Why.
+        reason: SessionError,
+    },
+}
+
+/// Why a connection ended.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum SessionError {
+    /// We said bye.
+    #[error("the client has ended the session")]
+    Done,
+    /// The connection could not be made, or was lost.
+    #[error("no connection to the server: {0}")]
+    Lost(String),
+    /// The server ended it.
+    #[error("the server has ended the session ({code:?}): {message}")]
+    Closed {
+        /// Why.
+        code: CloseCode,
+        /// The same for people.
+        message: String,
+    },
+    /// No welcome in time.
+    #[error("the server did not answer hello in time")]
+    HandshakeTimeout,
+    /// The server speaks another protocol.
+    #[error("the server speaks protocol {found}, this client {PROTOCOL}; update the older one")]
+    OtherProtocol {
+        /// Its version.
+        found: u16,
+    },
+    /// Another publisher than the pinned one.
+    #[error("the server's publisher is {found}, but {expected} is pinned; is it the right server?")]
+    WrongPublisher {
+        /// The pinned one.
+        expected: PublisherKey,
+        /// The one it names.
+        found: PublisherKey,
+    },
+    /// A message that cannot be read.
+    #[error("a message that cannot be read: {0}")]
+    Malformed(#[from] DecodeError),
+    /// A message over the limit.
+    #[error(transparent)]
+    TooLong(#[from] FrameTooLong),
+    /// A message that is out of place.
+    #[error("the server's message is out of place: {0}")]
+    OutOfPlace(&'static str),
+    /// A manifest that is damaged or was not signed by the publisher.
+    #[error(transparent)]
+    Manifest(#[from] ManifestError),
+    /// A difference that does not lead to what was signed; the whole manifest is asked for next.
+    #[error(transparent)]
+    Difference(#[from] ApplyError),
+    /// A manifest that is not newer than ours.
+    #[error("the server offers version {offered}, but version {held} is already held")]
+    WentBack {
+        /// The one we hold.
+        held: VersionNumber,
+        /// The one offered.
+        offered: VersionNumber,
+    },
+    /// A chunk whose bytes are not what was asked for.
+    #[error("chunk {hash} arrived damaged: {why}")]
+    DamagedChunk {
+        /// Its name.
+        hash: ChunkHash,
+        /// What is wrong with it.
+        why: &'static str,
+    },
+}
+
+impl SessionError {
+    /// Whether trying again is of no use.
+    pub fn is_final(&self) -> bool {
+        match self {
+            Self::Done
+            | Self::OtherProtocol { .. }
+            | Self::WrongPublisher { .. }
+            | Self::Manifest(_)
+            | Self::WentBack { .. } => true,
+            Self::Closed { code, .. } => {
+                matches!(code, CloseCode::TokenRefused | CloseCode::OtherProtocol)
+            }
+            _ => false,
+        }
+    }
+
+    /// The code to close the connection with.
+    pub fn close_code(&self) -> CloseCode {
+        match self {
+            Self::OtherProtocol { .. } => CloseCode::OtherProtocol,
+            Self::HandshakeTimeout => CloseCode::HandshakeTimeout,
+            Self::TooLong(_) => CloseCode::TooLong,
+            Self::Done | Self::Lost(_) | Self::WrongPublisher { .. } | Self::Closed { .. } => {
+                CloseCode::Done
+            }
+            _ => CloseCode::Malformed,
+        }
+    }
+}
+
+/// The client's side of the conversation. Lives across reconnections: it remembers the manifest
+/// and everything that is wanted.
+///
+/// See the [module](super) for how to drive it.
+#[derive(Debug)]
+pub struct Client {
+    config: ClientConfig,
+    link: Link,
+    /// Connections in a row that did not last.
+    failures: u32,
+    opened: Option<Time>,
+    random: u64,
+    publisher: Option<PublisherKey>,
+    manifest: Option<Arc<SignedManifest>>,
+    /// The last difference did not fit: ask for the whole manifest.
+    whole: bool,
+    applied: Option<VersionNumber>,
+    frames: FrameDecoder,
+    wants: Wants,
+    /// Chunk streams that have begun.
+    incoming: BTreeMap<u64, Incoming>,
+    outbox: VecDeque<ClientMessage>,
+    pace: Allowance,
+    events: VecDeque<ClientEvent>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Link {
+    Waiting { until: Time },
+    Connecting,
+    Hello { deadline: Time },
+    Answer { deadline: Time },
+    Open,
+    Closed,
+}
+
+#[derive(Debug)]
+struct Incoming {
+    /// Head, then the chunk.
+    bytes: Vec<u8>,
+    /// Nobody waits for it any more.
+    discard: bool,
+}
+
+impl Client {
+    /// Asks to be connected as soon as [`Client::handle_timeout`] is called.
+    pub fn new(config: ClientConfig) -> Self {
+        Self {
+            publisher: config.publisher,
+            random: config.jitter_seed,
+            config,
+            link: Link::Waiting { until: Time(0) },
+            failures: 0,
+            opened: None,
+            manifest: None,
+            whole: false,
+            applied: None,
+            frames: FrameDecoder::new(ServerMessage::BYTES_MAX),
+            wants: Wants::default(),
+            incoming: BTreeMap::new(),
+            outbox: VecDeque::new(),
+            pace: client_pace(),
+            events: VecDeque::new(),
+        }
+    }
+
+    /// The connection stands and the control stream is open.
+    pub fn handle_connected(&mut self, now: Time) {
+        if self.link == Link::Connecting {
+            self.frames = FrameDecoder::new(ServerMessage::BYTES_MAX);
+            self.link = Link::Hello { deadline: now.after_us(limits::HANDSHAKE_US_MAX) };
+        }
+    }
+
+    /// The connection could not be made, or was lost.
+    ///
+    /// `close`: error code and text of the server's close, where there was one.
+    pub fn handle_disconnected(&mut self, now: Time, close: Option<(u64, &str)>, why: &str) {
+        if matches!(self.link, Link::Waiting { .. } | Link::Closed) {
+            return;
+        }
+        let code = close.and_then(|(code, _)| CloseCode::from_number(code));
+        let reason = match (code, close) {
+            (Some(code), Some((_, text))) => {
+                SessionError::Closed { code, message: text.to_string() }
+            }
+            _ => SessionError::Lost(why.to_string()),
+        };
+        self.disconnect(now, reason);
+    }
+
+    /// Bytes from the control stream.
+    pub fn handle_control(&mut self, now: Time, bytes: &[u8]) {
+        if !self.is_talking() {
+            return;
+        }
+        self.frames.push(bytes);
+        while self.is_talking() {
+            let result = match self.frames.poll() {
+                Ok(None) => return,
+                Ok(Some(message)) => self.handle_message(now, &message),
+                Err(error) => Err(error.into()),
+            };
+            if let Err(reason) = result {
+                self.disconnect(now, reason);
+            }
+        }
+    }
+
+    /// Bytes from one of the server's unidirectional streams.
+    ///
+    /// * `stream`: any number that tells the connection's streams apart.
+    /// * `end`: no more bytes will follow.
+    pub fn handle_chunk(&mut self, now: Time, stream: u64, bytes: &[u8], end: bool) {
+        if !self.is_talking() {
+            return;
+        }
+        if let Err(reason) = self.receive(stream, bytes, end) {
+            self.disconnect(now, reason);
+        }
+    }
+
+    /// The server has cut this stream; its chunk is asked for again if it is still wanted.
+    pub fn handle_chunk_reset(&mut self, stream: u64) {
+        let Some(incoming) = self.incoming.remove(&stream) else { return };
+        if let Some(head) = incoming.bytes.first_chunk::<CHUNK_HEAD_BYTES>() {
+            self.wants.ask_again(&parse_chunk_head(head).0);
+        }
+    }
+
+    /// Time has passed.
+    pub fn handle_timeout(&mut self, now: Time) {
+        match self.link {
+            Link::Waiting { until } if now >= until => {
+                self.link = Link::Connecting;
+                self.events.push_back(ClientEvent::Connect);
+            }
+            Link::Hello { deadline } | Link::Answer { deadline } if now >= deadline => {
+                self.disconnect(now, SessionError::HandshakeTimeout);
+            }
+            _ => {}
+        }
+    }
+
+    /// Asks for a chunk, or changes the priority of one that is wanted already. It is remembered
+    /// across reconnections until it arrives, is [missing](ClientEvent::Missing) or cancelled.
+    ///
+    /// Says `false` when `WANTS_MAX` chunks are wanted already.
+    #[must_use]
+    pub fn want(&mut self, chunk: ChunkRef, priority: Priority) -> bool {
+        match self.wants.want(chunk, priority) {
+            Change::Full => return false,
+            Change::Queued => {}
+            Change::AskAgain => {
+                self.say(ClientMessage::Fetch { hash: chunk.hash, priority });
+            }
+        }
+        true
+    }
+
+    /// No longer wanted.
+    pub fn cancel(&mut self, hash: ChunkHash) {
+        if self.wants.forget(&hash) {
+            self.say(ClientMessage::Cancel { hash });
+        }
+    }
+
+    /// This version is being played now.
+    pub fn applied(&mut self, version: VersionNumber) {
+        self.applied = Some(version);
+        if self.link == Link::Open {
+            self.say(ClientMessage::Applied { version });
+        }
+    }
+
+    /// Reports what was seen. Long reports are split; while the line is down up to `OUTBOX_MAX`
+    /// reports are kept, then new ones are dropped.
+    pub fn report(&mut self, mut telemetry: Telemetry) {
+        while telemetry.edges.len() > limits::TELEMETRY_EDGES_MAX {
+            let at = telemetry.edges.len() - limits::TELEMETRY_EDGES_MAX;
+            let edges = telemetry.edges.split_off(at);
+            let part =
+                Telemetry { edges, exact: 0, substituted: 0, missed: 0, jumps: 0, ..telemetry };
+            self.say(ClientMessage::Telemetry(part));
+        }
+        self.say(ClientMessage::Telemetry(telemetry));
+    }
+
+    /// Says bye after what is queued; ends in a final `Disconnect`.
+    pub fn close(&mut self) {
+        if self.link == Link::Open {
+            self.outbox.push_back(ClientMessage::Bye);
+        } else if self.link != Link::Closed {
+            self.link = Link::Closed;
+            self.events.push_back(ClientEvent::Disconnect { reason: SessionError::Done });
+        }
+    }
+
+    /// Bytes for the control stream.
+    pub fn poll_transmit(&mut self, now: Time) -> Option<Vec<u8>> {
+        if let Link::Hello { deadline } = self.link {
+            self.link = Link::Answer { deadline };
+            return Some(frame(&self.hello().encode()));
+        }
+        let idle = self.outbox.is_empty() && !self.wants.is_ready();
+        if self.link != Link::Open || idle || self.pace.take(now, 1) == 0 {
+            return None;
+        }
+        let message = self.outbox.pop_front().or_else(|| {
+            let (hash, priority) = self.wants.ask()?;
+            Some(ClientMessage::Fetch { hash, priority })
+        })?;
+        if message == ClientMessage::Bye {
+            self.disconnect(now, SessionError::Done);
+        }
+        Some(frame(&message.encode()))
+    }
+
+    /// What to do next.
+    pub fn poll_event(&mut self) -> Option<ClientEvent> {
+        self.events.pop_front()
+    }
+
+    /// When to call [`Client::handle_timeout`] (and then poll) at the latest.
+    pub fn poll_timeout(&self) -> Option<Time> {
+        match self.link {
+            Link::Waiting { until } => Some(until),
+            Link::Hello { deadline } | Link::Answer { deadline } => Some(deadline),
+            Link::Open if !self.outbox.is_empty() || self.wants.is_ready() => {
+                Some(self.pace.ready_at())
+            }
+            Link::Open | Link::Connecting | Link::Closed => None,
+        }
+    }
+
+    /// The newest version received.
+    pub fn manifest(&self) -> Option<&Arc<SignedManifest>> {
+        self.manifest.as_ref()
+    }
+
+    /// The pinned publisher, or the one that the server has named.
+    pub fn publisher(&self) -> Option<PublisherKey> {
+        self.publisher
+    }
+
+    /// Chunks wanted and not yet here.
+    pub fn wanted(&self) -> usize {
+        self.wants.len()
+    }
+
+    /// Whether the server has let us in and the line is up.
+    pub fn is_open(&self) -> bool {
+        self.link == Link::Open
+    }
+
+    fn is_talking(&self) -> bool {
+        matches!(self.link, Link::Hello { .. } | Link::Answer { .. } | Link::Open)
+    }
+
+    fn hello(&self) -> ClientMessage {
+        let have = self
+            .manifest
+            .as_ref()
+            .filter(|_| !self.whole)
+            .map(|held| Have { version: held.manifest.number, hash: held.manifest.hash() });
+        ClientMessage::Hello(Hello {
+            protocol: PROTOCOL,
+            token: self.config.token.clone(),
+            garments: self.config.garments.clone(),
+            have,
+        })
+    }
+
+    /// Queues a message; drops it when the queue is full, which only reports can bring about.
+    fn say(&mut self, message: ClientMessage) {
+        let is_report = matches!(message, ClientMessage::Telemetry(_));
+        let keeps = is_report || self.link == Link::Open;
+        if keeps && self.outbox.len() < limits::OUTBOX_MAX {
+            self.outbox.push_back(message);
+        }
+    }
+
+    fn handle_message(&mut self, now: Time, bytes: &[u8]) -> Result<(), SessionError> {
+        let message = ServerMessage::decode(bytes)?;
+        let is_greeting =
+            matches!(message, ServerMessage::Welcome { .. } | ServerMessage::Close { .. });
+        if self.link != Link::Open && !is_greeting {
+            return Err(SessionError::OutOfPlace("something before welcome"));
+        }
+        match message {
+            ServerMessage::Welcome { .. } if self.link == Link::Open => {
+                Err(SessionError::OutOfPlace("a second welcome"))
+            }
+            ServerMessage::Welcome { protocol, .. } if protocol != PROTOCOL => {
+                Err(SessionError::OtherProtocol { found: protocol })
+            }
+            ServerMessage::Welcome { publisher, .. } => {
+                publisher.map_or(Ok(()), |publisher| self.meet(publisher))?;
+                self.link = Link::Open;
+                self.opened = Some(now);
+                self.events.push_back(ClientEvent::Welcome);
+                if let Some(version) = self.applied {
+                    self.say(ClientMessage::Applied { version });
+                }
+                Ok(())
+            }
+            ServerMessage::Publisher { publisher } => self.meet(publisher),
+            ServerMessage::ManifestFull(bytes) => {
+                let publisher = self.known_publisher()?;
+                self.accept(SignedManifest::open(&bytes, &publisher)?)
+            }
+            ServerMessage::ManifestDifference(bytes) => {
+                let publisher = self.known_publisher()?;
+                let difference = ManifestDifference::decode(&bytes)?;
+                let base = self.manifest.as_ref().filter(|_| !self.whole);
+                let base = base.ok_or(SessionError::OutOfPlace("a difference to nothing"))?;
+                let applied = difference.apply(&base.manifest, &publisher);
+                self.whole = applied.is_err();
+                self.accept(applied?)
+            }
+            ServerMessage::Missing { hash } => {
+                if self.wants.forget(&hash) {
+                    self.events.push_back(ClientEvent::Missing { hash });
+                }
+                Ok(())
+            }
+            ServerMessage::Close { code, message } => Err(SessionError::Closed { code, message }),
+        }
+    }
+
+    fn meet(&mut self, found: PublisherKey) -> Result<(), SessionError> {
+        match self.publisher {
+            Some(expected) if expected != found => {
+                Err(SessionError::WrongPublisher { expected, found })
+            }
+            _ => {
+                self.publisher = Some(found);
+                Ok(())
+            }
+        }
+    }
+
+    fn known_publisher(&self) -> Result<PublisherKey, SessionError> {
+        self.publisher.ok_or(SessionError::OutOfPlace("a manifest before its publisher"))
+    }
+
+    fn accept(&mut self, signed: SignedManifest) -> Result<(), SessionError> {
+        let offered = signed.manifest.number;
+        if let Some(held) = &self.manifest {
+            if self.whole && **held == signed {
+                self.whole = false;
+                return Ok(());
+            }
+            let held = held.manifest.number;
+            if offered <= held {
+                return Err(SessionError::WentBack { held, offered });
+            }
+        }
+        self.whole = false;
+        let signed = Arc::new(signed);
+        self.manifest = Some(signed.clone());
+        self.events.push_back(ClientEvent::Version(signed));
+        Ok(())
+    }
+
+    fn receive(&mut self, stream: u64, bytes: &[u8], end: bool) -> Result<(), SessionError> {
+        let known = self.incoming.contains_key(&stream);
+        if !known && self.incoming.len() >= limits::FETCHES_MAX {
+            return Err(SessionError::OutOfPlace("more chunk streams than fetches"));
+        }
+        let blank = || Incoming { bytes: Vec::new(), discard: false };
+        let incoming = self.incoming.entry(stream).or_insert_with(blank);
+        if !incoming.discard {
+            // A stream that nobody asked for is refused as soon as its head is there.
+            let head_lacks = CHUNK_HEAD_BYTES.saturating_sub(incoming.bytes.len());
+            let (head, body) = bytes.split_at(head_lacks.min(bytes.len()));
+            incoming.bytes.extend_from_slice(head);
+            if let Some(head) = incoming.bytes.first_chunk::<CHUNK_HEAD_BYTES>() {
+                let (hash, length) = parse_chunk_head(head);
+                let damaged = |why| SessionError::DamagedChunk { hash, why };
+                match self.wants.asked_bytes_of(&hash) {
+                    None => *incoming = Incoming { bytes: Vec::new(), discard: true },
+                    Some(expected) if expected != length => {
+                        return Err(damaged("its length is not the manifest's"));
+                    }
+                    Some(expected) => {
+                        incoming.bytes.extend_from_slice(body);
+                        if incoming.bytes.len() > CHUNK_HEAD_BYTES + expected as usize {
+                            return Err(damaged("it goes on after its end"));
+                        }
+                    }
+                }
+            }
+        }
+        if end { self.finish(stream) } else { Ok(()) }
+    }
+
+    fn finish(&mut self, stream: u64) -> Result<(), SessionError> {
+        let Some(mut incoming) = self.incoming.remove(&stream).filter(|i| !i.discard) else {
+            return Ok(());
+        };
+        let head = incoming.bytes.first_chunk::<CHUNK_HEAD_BYTES>();
+        let head = head.ok_or(SessionError::OutOfPlace("a chunk stream without a head"))?;
+        let (hash, length) = parse_chunk_head(head);
+        let bytes = incoming.bytes.split_off(CHUNK_HEAD_BYTES);
+        if bytes.len() != length as usize {
+            return Err(SessionError::DamagedChunk { hash, why: "it ends early" });
+        }
+        if ChunkHash::of(&bytes) != hash {
+            return Err(SessionError::DamagedChunk { hash, why: "its bytes have another hash" });
+        }
+        if self.wants.forget(&hash) {
+            self.events.push_back(ClientEvent::Chunk { hash, bytes });
+        }
+        Ok(())
+    }
+
+    fn disconnect(&mut self, now: Time, reason: SessionError) {
+        self.incoming.clear();
+        self.wants.ask_all_again();
+        self.outbox.retain(|message| matches!(message, ClientMessage::Telemetry(_)));
+        self.pace = client_pace();
+        let lasted_us = self.opened.take().map_or(0, |opened| now.0.saturating_sub(opened.0));
+        if lasted_us >= limits::RECONNECT_US_MAX {
+            self.failures = 0;
+        }
+        self.link = if reason.is_final() {
+            Link::Closed
+        } else {
+            Link::Waiting { until: now.after_us(self.delay_us()) }
+        };
+        self.events.push_back(ClientEvent::Disconnect { reason });
+    }
+
+    /// Doubles with every failure, up to a cap; half of it is chance, so that the clients of a
+    /// server that went down do not come back all at once.
+    fn delay_us(&mut self) -> u64 {
+        let doubled = limits::RECONNECT_US_MIN << self.failures.min(16);
+        self.failures += 1;
+        let delay_us = doubled.min(limits::RECONNECT_US_MAX);
+        // SplitMix64 (Steele, Lea and Flood 2014).
+        self.random = self.random.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut bits = self.random;
+        bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        delay_us / 2 + (bits ^ (bits >> 31)) % (delay_us / 2 + 1)
+    }
+}
+
+/// Half of what the server allows; starting small, for the server's clock may lag behind.
+fn client_pace() -> Allowance {
+    let per_second = limits::MESSAGES_PER_SECOND_MAX / 2;
+    Allowance::new(per_second, per_second / 2)
+}
