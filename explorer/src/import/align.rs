@@ -65,6 +65,16 @@ impl JointTrack {
         self.joints
     }
 
+    /// Frames that are kept: those of the clip and the extrapolated ones.
+    pub(super) fn stored_count(&self) -> usize {
+        self.frames + WINDOW
+    }
+
+    /// Joint positions of a kept frame, the first being [`WINDOW_REACH`] before the clip's.
+    pub(super) fn stored(&self, frame: usize) -> &[Vec3] {
+        &self.positions[frame * self.joints..(frame + 1) * self.joints]
+    }
+
     /// Joint positions of frames `frame - 2 ..= frame + 2`; `frame` may be one past the last.
     pub fn window(&self, frame: usize) -> &[Vec3] {
         &self.positions[frame * self.joints..(frame + WINDOW) * self.joints]

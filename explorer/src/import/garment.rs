@@ -8,10 +8,7 @@ use protocol::limits::{TRIANGLES_MAX, VERTICES_MAX};
 
 use super::character::{self, CharacterError};
 use super::gltf_file::Document;
-use super::refine::{self, TooFine};
-
-/// A triangle of a smaller area [m^2] is degenerate.
-const AREA_M2_MIN: f32 = 1e-9;
+use super::refine::{TooFine, refine};
 
 /// A triangle mesh as read.
 #[derive(Debug, Clone, PartialEq)]
@@ -159,40 +156,6 @@ impl Surface {
         }
     }
 
-    /// Refuses what cannot be simulated: vertices that are not finite, degenerate triangles,
-    /// edges of more than two triangles, neighbours wound against each other.
-    ///
-    /// # Errors
-    /// The first such place.
-    pub fn check(&self) -> Result<(), GarmentError> {
-        let refuse = |text: String| Err(GarmentError::Surface(text));
-        if let Some(vertex) = self.positions.iter().position(|p| !p.is_finite()) {
-            return refuse(format!("vertex {vertex} is not finite; export the mesh again"));
-        }
-        let mut directed = BTreeSet::new();
-        for (index, t) in self.triangles.iter().enumerate() {
-            let [a, b, c] = t.map(|v| self.positions[v as usize]);
-            let area_m2 = (b - a).cross(c - a).length() * 0.5;
-            if area_m2 < AREA_M2_MIN {
-                return refuse(format!(
-                    "triangle {index} near {a:.3} is degenerate (area {:.4} mm^2); dissolve it",
-                    area_m2 * 1e6
-                ));
-            }
-            for (from, to) in [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])] {
-                if !directed.insert((from, to)) {
-                    let at = self.positions[from as usize];
-                    return refuse(format!(
-                        "not a manifold surface: the edge of vertices {from} and {to} near {at:.3} \
-                         belongs to more than two triangles, or two neighbours are wound against \
-                         each other; separate the layers and make the normals consistent"
-                    ));
-                }
-            }
-        }
-        Ok(())
-    }
-
     /// Cuts edges until none is longer than `edge_length_m`.
     ///
     /// # Errors
@@ -202,15 +165,8 @@ impl Surface {
         if !(edge_length_m.is_finite() && edge_length_m > 0.0) {
             return Err(error("must be a positive number of metres".to_owned()));
         }
-        refine::refine(&mut self.positions, &mut self.triangles, edge_length_m, VERTICES_MAX)
+        refine(&mut self.positions, &mut self.triangles, edge_length_m, VERTICES_MAX)
             .map_err(|e: TooFine| error(e.to_string()))
-    }
-
-    /// Longest edge [m].
-    pub fn edge_length_max_m(&self) -> f32 {
-        let length =
-            |(a, b): (u32, u32)| self.positions[a as usize].distance(self.positions[b as usize]);
-        self.triangles.iter().flat_map(|t| refine::edges(*t)).map(length).fold(0.0, f32::max)
     }
 
     /// Boundary loops as vertex lists, in order of their smallest vertex.

@@ -5,15 +5,22 @@
 
 pub mod align;
 mod animation;
+pub mod bvh;
 pub mod character;
+pub mod check;
 pub mod components;
+pub mod compute;
 pub mod garment;
 pub mod gltf_file;
 pub mod motion_graph;
+pub mod reach;
 #[cfg(test)]
 mod real_data;
 pub mod refine;
+pub mod retarget;
 pub mod scene_file;
+#[cfg(test)]
+mod synthetic;
 pub mod transition;
 
 use std::path::{Path, PathBuf};
@@ -21,12 +28,15 @@ use std::sync::Arc;
 
 use protocol::PoseId;
 
+use self::bvh::{Bvh, BvhError};
 use self::character::{Character, CharacterError};
+use self::compute::{ComputeError, Density};
 use self::garment::{GarmentError, Surface};
 use self::gltf_file::FILE_BYTES_MAX;
 use self::motion_graph::{GraphFile, GraphReport, MotionGraphError};
 use self::scene_file::{MotionSource, SceneFile, SceneFileError, resolve_path};
 use self::transition::Transition;
+use crate::builtin::BuiltinError;
 use crate::primary::PrimaryGraph;
 use crate::scene::{Garment, Scene};
 
@@ -55,6 +65,9 @@ pub enum SceneError {
         /// What is wrong.
         source: SceneFileError,
     },
+    /// The built-in scene.
+    #[error(transparent)]
+    Builtin(#[from] BuiltinError),
     /// The character.
     #[error("{}: {source}", path.display())]
     Character {
@@ -62,6 +75,22 @@ pub enum SceneError {
         path: PathBuf,
         /// What is wrong.
         source: CharacterError,
+    },
+    /// A BVH clip.
+    #[error("{}: {source}", path.display())]
+    Bvh {
+        /// Its file.
+        path: PathBuf,
+        /// What is wrong.
+        source: BvhError,
+    },
+    /// The motion graph could not be computed.
+    #[error("{}: {source}", path.display())]
+    Compute {
+        /// The scene file.
+        path: PathBuf,
+        /// What is wrong.
+        source: ComputeError,
     },
     /// The motion graph.
     #[error("{}: {source}", path.display())]
@@ -105,18 +134,12 @@ pub fn load_scene(name_or_path: &str, data_dir: Option<&Path>) -> Result<Scene, 
 /// # Errors
 /// As for [`load_scene`].
 pub fn load(name_or_path: &str, data_dir: Option<&Path>) -> Result<Loaded, SceneError> {
-    match name_or_path {
-        "dress" => load_text(DRESS, Path::new("scenes/dress.toml"), data_dir),
-        _ => {
-            let path = Path::new(name_or_path);
-            let bytes = read(path, "the command line")?;
-            let text = String::from_utf8(bytes).map_err(|_| SceneError::File {
-                path: path.to_owned(),
-                source: SceneFileError::Toml("is not UTF-8 text; give a TOML file".to_owned()),
-            })?;
-            load_text(&text, path, data_dir)
-        }
+    if name_or_path == "robe" {
+        let scene = crate::builtin::robe()?;
+        return Ok(Loaded { scene, graph: None });
     }
+    let (text, path) = scene_text(name_or_path)?;
+    load_text(&text, &path, data_dir)
 }
 
 /// The data folder: the environment's `TOILE_DATA`, else the first `shared/data` beside the
@@ -130,21 +153,70 @@ pub fn data_dir() -> Option<PathBuf> {
     here.ancestors().map(beside).find(|data| data.join("character.glb").is_file())
 }
 
-/// A character with all clips of a scene file, and the path of its file.
+/// Computes the motion graph of a scene's character (`dress` or a file; not a built-in one).
+///
+/// * `density`: `None` takes what the scene file asks for.
 ///
 /// # Errors
-/// As for [`load_scene`].
-pub fn load_character(
-    file: &SceneFile,
-    path: &Path,
+/// As for [`load_scene`]; also where no density is given at all.
+pub fn scene_graph(
+    name_or_path: &str,
     data_dir: Option<&Path>,
-) -> Result<(Character, PathBuf), SceneError> {
-    let place = Place { scene: path, data: data_dir };
-    let glb = place.resolve("character.file", &file.character.file)?;
-    let bytes = read(&glb, "character.file")?;
-    let character = character::read_character(&bytes, glb.parent(), file.fps)
-        .map_err(|source| SceneError::Character { path: glb.clone(), source })?;
-    Ok((character, glb))
+    density: Option<Density>,
+) -> Result<GraphFile, SceneError> {
+    let (text, path) = scene_text(name_or_path)?;
+    let place = Place { scene: &path, data: data_dir };
+    let file = SceneFile::parse(&text).map_err(|e| place.error(e))?;
+    let written = file.motion_source().map_err(|e| place.error(e))?;
+    let density = match (density, written) {
+        (Some(density), _) | (None, MotionSource::Computed(density)) => density,
+        (None, MotionSource::File(_)) => {
+            return Err(place.error(SceneFileError::Value {
+                key: "motion_graph".to_owned(),
+                problem: "names a file; give the density to compute one with".to_owned(),
+            }));
+        }
+    };
+    let character = load_character(&file, &place)?;
+    let transitions =
+        compute::compute(&character.body.skeleton, &character.clips, file.fps, density)
+            .map_err(|source| SceneError::Compute { path: path.clone(), source })?;
+    Ok(compute::to_file(&character.clips, file.fps, &transitions))
+}
+
+/// The text of a scene file and where it lies.
+fn scene_text(name_or_path: &str) -> Result<(String, PathBuf), SceneError> {
+    if name_or_path == "dress" {
+        return Ok((DRESS.to_owned(), PathBuf::from("scenes/dress.toml")));
+    }
+    let path = PathBuf::from(name_or_path);
+    let text = String::from_utf8(read(&path, "the command line")?).map_err(|_| {
+        let source = SceneFileError::Toml("is not UTF-8 text; give a TOML file".to_owned());
+        SceneError::File { path: path.clone(), source }
+    })?;
+    Ok((text, path))
+}
+
+/// The character of a scene file with its animations, and BVH clips in place of or beside them.
+fn load_character(file: &SceneFile, place: &Place<'_>) -> Result<Character, SceneError> {
+    let path = place.resolve("character.file", &file.character.file)?;
+    let bytes = read(&path, "character.file")?;
+    let mut character = character::read_character(&bytes, path.parent(), file.fps)
+        .map_err(|source| SceneError::Character { path: path.clone(), source })?;
+    for (index, written) in file.character.clips.iter().enumerate() {
+        let key = format!("character.clips[{index}]");
+        let path = place.resolve(&key, written)?;
+        let bytes = read(&path, &key)?;
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let clip = Bvh::parse(&String::from_utf8_lossy(&bytes))
+            .and_then(|bvh| retarget::retarget(&name, &bvh, &character.body.skeleton, file.fps))
+            .map_err(|source| SceneError::Bvh { path, source })?;
+        match character.clips.iter_mut().find(|c| c.name == clip.name) {
+            Some(old) => *old = clip,
+            None => character.clips.push(clip),
+        }
+    }
+    Ok(character)
 }
 
 /// Loads a scene from the text of a scene file that lies (or would lie) at `path`.
@@ -154,7 +226,7 @@ pub fn load_character(
 pub fn load_text(text: &str, path: &Path, data_dir: Option<&Path>) -> Result<Loaded, SceneError> {
     let place = Place { scene: path, data: data_dir };
     let file = SceneFile::parse(text).map_err(|e| place.error(e))?;
-    let (character, _) = load_character(&file, path, data_dir)?;
+    let character = load_character(&file, &place)?;
     let (primary, graph) = load_primary(&file, &character, &place)?;
     let start = start_pose(&file, &primary).map_err(|e| place.error(e))?;
     let garment = load_garment(&file, &character, &place)?;
@@ -211,6 +283,7 @@ fn transitions(
     character: &Character,
     place: &Place<'_>,
 ) -> Result<(PathBuf, Vec<Transition>), SceneError> {
+    let skeleton = &character.body.skeleton;
     match source {
         MotionSource::File(written) => {
             let path = place.resolve("motion_graph.file", written)?;
@@ -224,11 +297,12 @@ fn transitions(
                 Err(source) => Err(SceneError::MotionGraph { path, source }),
             }
         }
-        MotionSource::Threshold(_) | MotionSource::Reach(_) => {
-            Err(place.error(SceneFileError::Value {
-                key: "motion_graph".to_owned(),
-                problem: "is read from a file; write one with toile scene graph".to_owned(),
-            }))
+        MotionSource::Computed(density) => {
+            let path = place.scene.to_owned();
+            match compute::compute(skeleton, &character.clips, file.fps, *density) {
+                Ok(transitions) => Ok((path, transitions)),
+                Err(source) => Err(SceneError::Compute { path, source }),
+            }
         }
     }
 }
@@ -260,13 +334,14 @@ fn load_garment(
     let attachments = table.attachments().map_err(|e| place.error(e))?;
     let make = || {
         let mut surface = Surface::read(&path, &bytes)?;
-        surface.check()?;
+        check::check_mesh(&surface.positions, &surface.triangles)?;
         let file_vertices = surface.positions.len();
         if let Some(edge_length_m) = table.edge_length_m {
             surface.refine(edge_length_m)?;
         }
         let skeleton = &character.body.skeleton;
         let attached = surface.attach(&attachments, skeleton, file_vertices)?;
+        check::check_garment(&character.body, &surface.positions, &surface.triangles)?;
         Ok((surface, attached))
     };
     let (surface, attached) =

@@ -113,7 +113,7 @@ impl<'a> Mesh<'a> {
 }
 
 /// The three edges, smaller index first.
-pub(super) fn edges(t: [u32; 3]) -> [Edge; 3] {
+fn edges(t: [u32; 3]) -> [Edge; 3] {
     [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])].map(|(a, b)| (a.min(b), a.max(b)))
 }
 

@@ -29,6 +29,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use super::compute::Density;
 use super::garment::Attachment;
 use crate::scene::{ExplorationSettings, Fabric};
 
@@ -182,10 +183,8 @@ pub struct ExplorationTable {
 pub enum MotionSource {
     /// A JSON file, as written.
     File(String),
-    /// All local minima below a distance [m].
-    Threshold(f32),
-    /// As few as bring the median time to reach a clip below this [s].
-    Reach(f32),
+    /// Computed from the clips.
+    Computed(Density),
 }
 
 impl SceneFile {
@@ -239,11 +238,11 @@ impl SceneFile {
             (Some(file), None, None) => Ok(MotionSource::File(file.clone())),
             (None, Some(threshold_m), None) => {
                 in_range("motion_graph.threshold_m", threshold_m, [1e-3, 10.0])?;
-                Ok(MotionSource::Threshold(threshold_m))
+                Ok(MotionSource::Computed(Density::Threshold(threshold_m)))
             }
             (None, None, Some(reach_s)) => {
                 in_range("motion_graph.reach_s", reach_s, [0.1, 1e4])?;
-                Ok(MotionSource::Reach(reach_s))
+                Ok(MotionSource::Computed(Density::Reach(reach_s)))
             }
             _ => Err(value("motion_graph", "give exactly one of file, threshold_m, reach_s")),
         }

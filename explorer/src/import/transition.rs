@@ -146,43 +146,12 @@ fn log(q: Quat) -> Vec3 {
 
 #[cfg(test)]
 mod tests {
-    use cloth::Rigid;
-
+    use super::super::synthetic::{chain, walk};
     use super::*;
-
-    fn clip(name: &str, speed: f32, bend: f32) -> Clip {
-        let pose = |frame: i32| {
-            let t = frame as f32 / 30.0;
-            Pose {
-                root: Vec3::new(0.0, 1.0 + bend * 0.1, speed * t),
-                rotations: vec![
-                    Quat::from_rotation_y(0.1 * t),
-                    Quat::from_rotation_x(bend + bend * t),
-                    Quat::from_rotation_z(0.3 * bend * (4.0 * t).sin()),
-                ],
-            }
-        };
-        Clip { name: name.into(), poses: (0..40).map(pose).collect() }
-    }
-
-    fn chain() -> Skeleton {
-        let offsets = [Vec3::Y, Vec3::new(0.1, 0.3, 0.0), Vec3::new(0.0, 0.3, 0.1)];
-        let mut at = Vec3::ZERO;
-        let rest = offsets.map(|o| {
-            at += o;
-            Rigid { rotation: Quat::IDENTITY, translation: at }
-        });
-        Skeleton {
-            names: ["Hips", "Spine", "Head"].map(String::from).to_vec(),
-            parents: vec![None, Some(0), Some(1)],
-            offsets: offsets.to_vec(),
-            rest: rest.to_vec(),
-        }
-    }
 
     #[test]
     fn the_first_pose_is_what_would_have_followed_and_the_last_leads_into_the_target() {
-        let clips = [clip("walk", 1.0, 0.1), clip("run", 1.4, 0.5)];
+        let clips = [walk("walk", 40, 1.0, 0.1), walk("run", 40, 1.4, 0.5)];
         let skeleton = chain();
         let tracks = tracks(&skeleton, &clips);
         for (from_frame, to_frame) in [(20, 10), (39, 0), (39, 33)] {

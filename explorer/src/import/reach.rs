@@ -1,0 +1,99 @@
+//! How long it takes to reach a given clip.
+
+use serde::Serialize;
+
+use super::components::Digraph;
+use super::motion_graph::Topology;
+use super::transition::Transition;
+use crate::primary::PrimaryGraph;
+
+/// Times of the shortest walks from every pose to every clip that it is not in.
+///
+/// A walk ends at the first frame of the clip itself (not of a transition into it).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Reach {
+    /// Half of all walks are shorter [s]; infinite where most clips cannot be reached.
+    pub median_s: f32,
+    /// Nine tenths are shorter [s].
+    pub p90_s: f32,
+}
+
+impl Reach {
+    /// Of a primary graph.
+    pub fn of_graph(primary: &PrimaryGraph) -> Self {
+        let edges: Vec<_> = primary.edges().iter().map(|e| (e.from.0, e.to.0)).collect();
+        let graph = Digraph::new(primary.poses().len(), &edges);
+        let clip_of = |pose: usize| {
+            let pose = &primary.poses()[pose];
+            (!pose.transition).then_some(usize::from(pose.clip))
+        };
+        Self::measure(&graph, &clip_of, primary.clips().len(), primary.fps())
+    }
+
+    /// Of clips and transitions, over the component that would be kept.
+    pub fn of_clips(frames: &[usize], transitions: &[Transition], fps: f32) -> Self {
+        let topology = Topology::new(frames, transitions, true);
+        let graph = topology.digraph();
+        let kept = graph.largest_cycle_component();
+        let mut id = vec![u32::MAX; topology.nodes];
+        for (new, old) in kept.iter().enumerate() {
+            id[*old as usize] = new as u32;
+        }
+        let edges = topology.edges.iter().map(|(a, b)| (id[*a as usize], id[*b as usize]));
+        let edges: Vec<_> = edges.filter(|(a, b)| *a != u32::MAX && *b != u32::MAX).collect();
+        let ends: Vec<u32> =
+            (0..frames.len()).map(|clip| topology.clip_first[clip] + frames[clip] as u32).collect();
+        let clip_of = |node: usize| ends.iter().position(|end| kept[node] < *end);
+        Self::measure(&Digraph::new(kept.len(), &edges), &clip_of, frames.len(), fps)
+    }
+
+    fn measure(
+        graph: &Digraph,
+        clip_of: &dyn Fn(usize) -> Option<usize>,
+        clips: usize,
+        fps: f32,
+    ) -> Self {
+        let clip: Vec<Option<usize>> = (0..graph.node_count()).map(clip_of).collect();
+        let mut steps = Vec::new();
+        for target in 0..clips {
+            let inside = |node: &u32| clip[*node as usize] == Some(target);
+            let targets: Vec<u32> = (0..graph.node_count() as u32).filter(inside).collect();
+            steps.extend(graph.steps_to(&targets).into_iter().filter(|s| *s > 0));
+        }
+        steps.sort_unstable();
+        let quantile = |share: f32| match steps.len() {
+            0 => 0.0,
+            count => match steps[((count - 1) as f32 * share) as usize] {
+                u32::MAX => f32::INFINITY,
+                frames => frames as f32 / fps,
+            },
+        };
+        Self { median_s: quantile(0.5), p90_s: quantile(0.9) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_clips_with_one_way_each() {
+        // Both of 30 frames, left at their end and entered at frame 0: a ring in which frames
+        // 0 to 9 of each are replaced by transitions.
+        let way = |from_clip, to_clip| Transition {
+            from_clip,
+            from_frame: 29,
+            to_clip,
+            to_frame: 0,
+            distance_m: 0.0,
+        };
+        let reach = Reach::of_clips(&[30, 30], &[way(0, 1), way(1, 0)], 1.0);
+        // From frame f of a clip 29 - f frames to its end, 11 to the other clip; from pose k of a
+        // transition 10 - k to the clip it leads to and 40 - k to the other.
+        let mut all: Vec<u32> = (10..30).map(|f| 29 - f + 11).collect();
+        all.extend((0..10).flat_map(|k| [10 - k, 40 - k]));
+        all.sort_unstable();
+        assert_eq!(reach.median_s, all[(all.len() - 1) / 2] as f32);
+        assert_eq!(reach.p90_s, all[((all.len() - 1) as f32 * 0.9) as usize] as f32);
+    }
+}
