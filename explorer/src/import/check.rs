@@ -246,3 +246,15 @@ fn check_side(body: &Body, mesh: &Mesh, at: &[f32]) -> Result<(), GarmentError> 
         100.0 * towards / (towards + away)
     )))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_built_in_scene_passes_the_same_check() {
+        let report = check_scene("robe", None).unwrap();
+        assert!(report.cloth.vertices >= 3000 && report.initial_dead_ends >= 20, "{report}");
+        assert!(report.edges <= 600 && report.largest_component == report.poses, "{report}");
+    }
+}

@@ -93,7 +93,7 @@ mod tests {
         let mut all: Vec<u32> = (10..30).map(|f| 29 - f + 11).collect();
         all.extend((0..10).flat_map(|k| [10 - k, 40 - k]));
         all.sort_unstable();
-        assert_eq!(reach.median_s, all[(all.len() - 1) / 2] as f32);
-        assert_eq!(reach.p90_s, all[((all.len() - 1) as f32 * 0.9) as usize] as f32);
+        assert_eq!(reach.median_s as u32, all[(all.len() - 1) / 2]);
+        assert_eq!(reach.p90_s as u32, all[((all.len() - 1) as f32 * 0.9) as usize]);
     }
 }
