@@ -2,11 +2,12 @@
 //!
 //! Wings: [`import`] reads scenes, characters, motion graphs and garments; [`builtin`] makes the
 //! built-in scene; [`grow`] explores (graph, metric, queue, jobs, journal); [`pack`] builds the
-//! basis, encodes and publishes.
+//! basis, encodes and publishes; [`explore`] ties them together.
 //!
 //! Non-goals: who is connected (they meet in the store), what a region's bytes mean (`codec`).
 
 pub mod builtin;
+pub mod explore;
 pub mod grid;
 pub mod grow;
 pub mod import;

@@ -1,0 +1,453 @@
+//! The secondary graph: which state follows which on every primary edge.
+//!
+//! Only the links live here; states themselves lie in [`super::states`]. Operations are pure,
+//! check what they are given before they change anything, and are those of Kim et al. 2013,
+//! section 3.2: merge a dead end, revert a merge, attach what was simulated.
+//!
+//! Between two commits the graph is **total** once it was initialised: every state is interior
+//! (all its out-edges were simulated) or a dead end that is merged into an interior state of its
+//! pose. An interior state's link names the state simulated next even where that one is a dead
+//! end, so that undoing a merge moves only the edge that leads to that dead end.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use protocol::{EdgeId, PoseId, StateId};
+
+use super::queue::Queue;
+use crate::primary::PrimaryGraph;
+use crate::view::Run;
+
+/// What a state is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Kind {
+    /// Its out-edges are being simulated; only inside a commit or the initial pass.
+    Open {
+        /// What was simulated so far, per out-edge of its pose.
+        next: Vec<Option<StateId>>,
+    },
+    /// All its out-edges were simulated.
+    Interior {
+        /// The state simulated on each out-edge of its pose.
+        next: Vec<StateId>,
+    },
+    /// Simulated, merged into another.
+    DeadEnd {
+        /// An interior state of the same pose.
+        target: StateId,
+        /// The metric's distance between the two [m].
+        error_m: f32,
+    },
+}
+
+/// A merge as it was made; kept for ever, also when it was undone.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Merge {
+    /// The commit that made it.
+    pub commit: u64,
+    /// Into which interior state.
+    pub target: StateId,
+    /// At which distance [m].
+    pub error_m: f32,
+}
+
+/// A node of the secondary graph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct State {
+    /// Its pose.
+    pub pose: PoseId,
+    /// The state it was simulated from, and along which edge; `None` for the drape.
+    pub parent: Option<(StateId, EdgeId)>,
+    /// What it is now.
+    pub kind: Kind,
+    /// The commit since which it is interior.
+    pub interior_since: Option<u64>,
+    /// Every merge it went through, oldest first.
+    pub merges: Vec<Merge>,
+}
+
+/// The graph after one commit; commits are numbered from 0 (the drape).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moment {
+    /// States created so far.
+    pub states: u64,
+    /// Runs created so far.
+    pub runs: usize,
+    /// Largest merge error [m].
+    pub worst_error_m: f32,
+}
+
+/// An operation that does not fit the graph.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum GraphError {
+    /// No such state.
+    #[error("there is no state {0}")]
+    NoState(StateId),
+    /// The state is not of the kind that the operation needs.
+    #[error("state {0} is {1}, but {2} is needed")]
+    WrongKind(StateId, &'static str, &'static str),
+    /// The edge does not leave the state's pose, or was simulated before.
+    #[error("edge {1} cannot be attached to state {0}")]
+    WrongEdge(StateId, EdgeId),
+    /// A merge into another pose.
+    #[error("state {0} cannot merge into {1}: another pose")]
+    WrongPose(StateId, StateId),
+    /// A distance that is none.
+    #[error("state {0} cannot merge at a distance of {1} m")]
+    WrongError(StateId, f32),
+    /// A state was left open at the end of a commit.
+    #[error("state {0} was left without a successor on some edge")]
+    NotTotal(StateId),
+    /// Two tables disagree.
+    #[error("state {0}: {1}")]
+    Broken(StateId, &'static str),
+}
+
+/// The secondary graph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Graph {
+    primary: Arc<PrimaryGraph>,
+    states: Vec<State>,
+    runs: Vec<Run>,
+    interior: Vec<Vec<StateId>>,
+    dead_ends: Vec<BTreeSet<StateId>>,
+    queue: Queue,
+    open: BTreeSet<StateId>,
+    moments: Vec<Moment>,
+    initialised: Option<u64>,
+}
+
+impl Graph {
+    /// The graph of the drape alone, which is state 0 and commit 0.
+    pub fn new(primary: Arc<PrimaryGraph>, start: PoseId) -> Self {
+        let poses = primary.poses().len();
+        let mut graph = Self {
+            primary,
+            states: Vec::new(),
+            runs: Vec::new(),
+            interior: vec![Vec::new(); poses],
+            dead_ends: vec![BTreeSet::new(); poses],
+            queue: Queue::default(),
+            open: BTreeSet::new(),
+            moments: Vec::new(),
+            initialised: None,
+        };
+        graph.push(start, None);
+        graph.end_commit();
+        graph
+    }
+
+    /// The primary graph below.
+    pub fn primary(&self) -> &Arc<PrimaryGraph> {
+        &self.primary
+    }
+
+    /// All states, by id.
+    pub fn states(&self) -> &[State] {
+        &self.states
+    }
+
+    /// A state by id.
+    pub fn state(&self, state: StateId) -> &State {
+        &self.states[state.index()]
+    }
+
+    /// Id of the next state to be created.
+    pub fn next_id(&self) -> StateId {
+        StateId(self.states.len() as u64)
+    }
+
+    /// Runs of consecutive states, in order of creation.
+    pub fn runs(&self) -> &[Run] {
+        &self.runs
+    }
+
+    /// Interior states of a pose, in the order in which they became interior.
+    pub fn interior(&self, pose: PoseId) -> &[StateId] {
+        &self.interior[pose.index()]
+    }
+
+    /// Dead ends of a pose, by id.
+    pub fn dead_ends(&self, pose: PoseId) -> &BTreeSet<StateId> {
+        &self.dead_ends[pose.index()]
+    }
+
+    /// All dead ends, largest merge error first.
+    pub fn queue(&self) -> &Queue {
+        &self.queue
+    }
+
+    /// States that are neither interior nor merged: none between commits once initialised.
+    pub fn open(&self) -> &BTreeSet<StateId> {
+        &self.open
+    }
+
+    /// The graph's figures after each commit, by its number.
+    pub fn moments(&self) -> &[Moment] {
+        &self.moments
+    }
+
+    /// Number of the last commit.
+    pub fn commit(&self) -> u64 {
+        self.moments.len() as u64 - 1
+    }
+
+    /// The commit that ended the initial pass, once it did.
+    pub fn initialised(&self) -> Option<u64> {
+        self.initialised
+    }
+
+    /// Frames simulated so far, drape apart: every one of them is a state.
+    pub fn simulated_frames(&self) -> u64 {
+        self.states.len() as u64 - 1
+    }
+
+    /// Largest merge error [m].
+    pub fn worst_error_m(&self) -> f32 {
+        self.queue.worst_m()
+    }
+
+    /// Mean merge error [m]; 0 without dead ends.
+    pub fn mean_error_m(&self) -> f32 {
+        let sum: f64 = self.queue.iter().map(|(_, error_m)| f64::from(error_m)).sum();
+        (sum / self.queue.len().max(1) as f64) as f32
+    }
+
+    /// The commit with the lowest worst error since the initial pass, of equals the last (the
+    /// paper's Figure 7); `None` before the end of that pass.
+    pub fn best_commit(&self) -> Option<u64> {
+        let first = self.initialised?;
+        let since = &self.moments[first as usize..];
+        let key = |m: &Moment| m.worst_error_m;
+        let least = since.iter().map(key).fold(f32::INFINITY, f32::min);
+        let last = since.iter().rposition(|m| m.worst_error_m <= least)?;
+        Some(first + last as u64)
+    }
+
+    /// The paper's transition table C(c, edge): the interior state that follows `state` on the
+    /// `edge`, merges applied. `None` where `state` is not interior or `edge` leaves another pose.
+    pub fn follow(&self, state: StateId, edge: EdgeId) -> Option<StateId> {
+        let Kind::Interior { next } = &self.states.get(state.index())?.kind else { return None };
+        let next = *next.get(self.slot(state, edge)?)?;
+        match self.state(next).kind {
+            Kind::DeadEnd { target, .. } => Some(target),
+            _ => Some(next),
+        }
+    }
+
+    /// Lowest worst merge error since the initial pass [m]; `None` before its end.
+    pub fn best_worst_error_m(&self) -> Option<f32> {
+        Some(self.moments[self.best_commit()? as usize].worst_error_m)
+    }
+
+    /// Adds the state simulated from `parent` along `edge`; it is open.
+    ///
+    /// # Errors
+    /// `parent` is not open, or the edge is not one of its pose or was simulated before.
+    pub fn attach(&mut self, parent: StateId, edge: EdgeId) -> Result<StateId, GraphError> {
+        let slot = match &self.known(parent)?.kind {
+            Kind::Open { next } => self.slot(parent, edge).filter(|slot| next[*slot].is_none()),
+            other => return Err(GraphError::WrongKind(parent, other.name(), "an open state")),
+        };
+        let slot = slot.ok_or(GraphError::WrongEdge(parent, edge))?;
+        let child = self.push(self.primary.edge(edge).to, Some((parent, edge)));
+        if let Kind::Open { next } = &mut self.states[parent.index()].kind {
+            next[slot] = Some(child);
+        }
+        Ok(child)
+    }
+
+    /// Makes an open state interior: all its edges were simulated.
+    ///
+    /// # Errors
+    /// It is not open, or an edge is missing.
+    pub fn close(&mut self, state: StateId) -> Result<(), GraphError> {
+        let next = match &self.known(state)?.kind {
+            Kind::Open { next } => next.iter().copied().collect::<Option<Vec<_>>>(),
+            other => return Err(GraphError::WrongKind(state, other.name(), "an open state")),
+        };
+        let next = next.ok_or(GraphError::NotTotal(state))?;
+        let commit = self.moments.len() as u64;
+        let entry = &mut self.states[state.index()];
+        entry.kind = Kind::Interior { next };
+        entry.interior_since = Some(commit);
+        self.interior[entry.pose.index()].push(state);
+        self.open.remove(&state);
+        Ok(())
+    }
+
+    /// Removes a dead end: merges an open state without successors into an interior one.
+    ///
+    /// # Errors
+    /// `state` is not open or has successors, `target` is not an interior state of the same pose,
+    /// or the error is not a distance.
+    pub fn merge(
+        &mut self,
+        state: StateId,
+        target: StateId,
+        error_m: f32,
+    ) -> Result<(), GraphError> {
+        let bare = match &self.known(state)?.kind {
+            Kind::Open { next } => next.iter().all(Option::is_none),
+            _ => false,
+        };
+        if !bare {
+            let is = self.state(state).kind.name();
+            return Err(GraphError::WrongKind(state, is, "an open state without successors"));
+        }
+        self.check_target(state, target, error_m)?;
+        self.open.remove(&state);
+        let pose = self.state(state).pose;
+        self.dead_ends[pose.index()].insert(state);
+        self.set_merge(state, target, error_m);
+        Ok(())
+    }
+
+    /// Undoes the merge of a dead end, which is open again; says what it was. Nothing else moves.
+    ///
+    /// # Errors
+    /// `state` is not a dead end.
+    pub fn revert(&mut self, state: StateId) -> Result<Merge, GraphError> {
+        let Kind::DeadEnd { error_m, .. } = self.known(state)?.kind else {
+            let is = self.state(state).kind.name();
+            return Err(GraphError::WrongKind(state, is, "a dead end"));
+        };
+        let pose = self.state(state).pose;
+        self.queue.remove(state, error_m);
+        self.dead_ends[pose.index()].remove(&state);
+        self.open.insert(state);
+        let next = vec![None; self.primary.out_degree(pose)];
+        let entry = &mut self.states[state.index()];
+        entry.kind = Kind::Open { next };
+        Ok(*entry.merges.last().expect("a dead end was merged"))
+    }
+
+    /// Moves a dead end to a nearer interior state.
+    ///
+    /// # Errors
+    /// `state` is not a dead end, `target` is not an interior state of its pose, or is not nearer.
+    pub fn remerge(
+        &mut self,
+        state: StateId,
+        target: StateId,
+        error_m: f32,
+    ) -> Result<(), GraphError> {
+        let Kind::DeadEnd { error_m: before_m, .. } = self.known(state)?.kind else {
+            let is = self.state(state).kind.name();
+            return Err(GraphError::WrongKind(state, is, "a dead end"));
+        };
+        self.check_target(state, target, error_m)?;
+        if error_m >= before_m {
+            return Err(GraphError::WrongError(state, error_m));
+        }
+        self.queue.remove(state, before_m);
+        self.set_merge(state, target, error_m);
+        Ok(())
+    }
+
+    /// Ends a commit: what was done since the last is one step of the graph's history.
+    pub fn end_commit(&mut self) {
+        self.moments.push(Moment {
+            states: self.states.len() as u64,
+            runs: self.runs.len(),
+            worst_error_m: self.queue.worst_m(),
+        });
+    }
+
+    /// Ends the initial pass: from here on the graph is total after every commit.
+    ///
+    /// # Errors
+    /// A state was left open.
+    pub fn end_initial_pass(&mut self) -> Result<(), GraphError> {
+        self.check_total()?;
+        self.initialised = Some(self.moments.len() as u64);
+        self.end_commit();
+        Ok(())
+    }
+
+    /// No state is open. Cheap: for every commit.
+    ///
+    /// # Errors
+    /// The first open state.
+    pub fn check_total(&self) -> Result<(), GraphError> {
+        self.open.first().map_or(Ok(()), |state| Err(GraphError::NotTotal(*state)))
+    }
+
+    fn push(&mut self, pose: PoseId, parent: Option<(StateId, EdgeId)>) -> StateId {
+        let id = self.next_id();
+        let next = vec![None; self.primary.out_degree(pose)];
+        self.states.push(State {
+            pose,
+            parent,
+            kind: Kind::Open { next },
+            interior_since: None,
+            merges: Vec::new(),
+        });
+        self.open.insert(id);
+        let job = self.moments.len() as u64;
+        match self.runs.last_mut() {
+            Some(run) if run.job == job && parent.is_some_and(|(p, _)| p.0 + 1 == id.0) => {
+                run.count += 1;
+            }
+            _ => {
+                let initial = self.initialised.is_none();
+                self.runs.push(Run { first: id, count: 1, job, initial });
+            }
+        }
+        id
+    }
+
+    fn set_merge(&mut self, state: StateId, target: StateId, error_m: f32) {
+        let commit = self.moments.len() as u64;
+        self.queue.insert(state, error_m);
+        let entry = &mut self.states[state.index()];
+        entry.kind = Kind::DeadEnd { target, error_m };
+        entry.merges.push(Merge { commit, target, error_m });
+    }
+
+    fn known(&self, state: StateId) -> Result<&State, GraphError> {
+        self.states.get(state.index()).ok_or(GraphError::NoState(state))
+    }
+
+    fn check_target(
+        &self,
+        state: StateId,
+        target: StateId,
+        error_m: f32,
+    ) -> Result<(), GraphError> {
+        let other = self.known(target)?;
+        if !matches!(other.kind, Kind::Interior { .. }) {
+            return Err(GraphError::WrongKind(target, other.kind.name(), "an interior state"));
+        }
+        if other.pose != self.state(state).pose {
+            return Err(GraphError::WrongPose(state, target));
+        }
+        if !(error_m.is_finite() && error_m >= 0.0) {
+            return Err(GraphError::WrongError(state, error_m));
+        }
+        Ok(())
+    }
+
+    /// Which out-edge of the state's pose `edge` is.
+    pub(super) fn slot(&self, state: StateId, edge: EdgeId) -> Option<usize> {
+        let first = self.primary.out_edges(self.state(state).pose).next()?;
+        let slot = edge.0.checked_sub(first.0)? as usize;
+        (slot < self.primary.out_degree(self.state(state).pose)).then_some(slot)
+    }
+}
+
+impl Kind {
+    /// In words, for messages.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Open { .. } => "open",
+            Self::Interior { .. } => "interior",
+            Self::DeadEnd { .. } => "a dead end",
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "graph_tests.rs"]
+pub(crate) mod tests;

@@ -1,0 +1,356 @@
+//! What a worker does: simulate from one state, decide which new states are dead ends, and find
+//! the most similar interior state for each.
+//!
+//! Every decision depends on the job's start and on the snapshot of its round alone.
+
+use std::collections::VecDeque;
+use std::io;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use protocol::{EdgeId, PoseId, StateId};
+
+use super::metric::Metric;
+use super::plan::{InitialJob, Plan};
+use super::states::StateFile;
+use crate::grid::GridState;
+use crate::primary::PrimaryGraph;
+use crate::simulator::{FrameQuality, SimulateError, Simulator};
+
+/// Most states of one job. Only a dense primary graph gets there: beyond it the tree stops.
+pub const JOB_STATES_MAX: usize = 512;
+
+/// What jobs are judged by.
+#[derive(Debug, Clone, Copy)]
+pub struct Rules {
+    /// How far states are apart.
+    pub metric: Metric,
+    /// A trajectory stops this near to a known state [m].
+    pub tolerance_m: f32,
+    /// Longest way from the start [frames].
+    pub depth_frames: u32,
+    /// As in the paper: neither early stop nor re-merging.
+    pub paper: bool,
+}
+
+/// What all jobs of a round share.
+#[derive(Debug, Clone, Copy)]
+pub struct Context<'a> {
+    /// The primary graph.
+    pub primary: &'a PrimaryGraph,
+    /// The plan of the initial pass.
+    pub plan: &'a Plan,
+    /// All states so far.
+    pub states: &'a StateFile,
+    /// Interior states of the snapshot by pose, by id.
+    pub known: &'a [Vec<StateId>],
+    /// How to judge.
+    pub rules: &'a Rules,
+    /// Set when jobs are to be dropped.
+    pub abandon: &'a AtomicBool,
+}
+
+/// A state that has an id, or one of the job's own by its place in [`Outcome::frames`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Local {
+    /// Has an id.
+    Known(StateId),
+    /// Of this job.
+    New(u32),
+}
+
+/// A simulated frame of a job.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LocalFrame {
+    /// What it was simulated from.
+    pub parent: Local,
+    /// Along which edge.
+    pub edge: EdgeId,
+    /// For a dead end of an expansion: the most similar interior state and its distance [m].
+    pub merge: Option<(Local, f32)>,
+}
+
+/// What a job found, chain by chain.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Outcome {
+    /// Its frames; a parent comes before its children.
+    pub frames: Vec<LocalFrame>,
+    /// The states at their ends.
+    pub states: Vec<GridState>,
+    /// Their measures, added up.
+    pub quality: FrameQuality,
+}
+
+/// Why a job has no outcome.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum JobError {
+    /// A frame could not be simulated.
+    #[error("edge {edge}, {depth} frames from its start: {source}")]
+    Simulate {
+        /// The edge.
+        edge: EdgeId,
+        /// How far the job had come [frames].
+        depth: u32,
+        /// What the simulator said.
+        source: SimulateError,
+    },
+    /// A state could not be read.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// It was asked to stop.
+    #[error("dropped")]
+    Abandoned,
+}
+
+/// The interior state nearest to `state` among `candidates` that is at most `bound_m` away; of
+/// equals the lowest id. Its distance is in metres.
+///
+/// # Errors
+/// A candidate could not be read.
+pub fn nearest(
+    states: &StateFile,
+    metric: &Metric,
+    state: &GridState,
+    candidates: &[StateId],
+    bound_m: f32,
+) -> io::Result<Option<(StateId, f32)>> {
+    let mut best: Option<(StateId, f32)> = None;
+    for &candidate in candidates {
+        let bound_m = best.map_or(bound_m, |(_, error_m)| error_m);
+        let other = states.read(candidate)?;
+        if let Some(error_m) = metric.distance_within(state, &other, bound_m) {
+            let better = |(id, least_m): (StateId, f32)| (error_m, candidate) < (least_m, id);
+            if best.is_none_or(better) {
+                best = Some((candidate, error_m));
+            }
+        }
+    }
+    Ok(best)
+}
+
+/// Runs a job of the initial pass from the state of its start pose.
+///
+/// # Errors
+/// A frame could not be simulated, a state not read, or the job was dropped.
+pub fn initial(
+    context: &Context<'_>,
+    simulator: &mut dyn Simulator,
+    job: &InitialJob,
+    start: StateId,
+) -> Result<Outcome, JobError> {
+    let from = context.states.read(start)?;
+    let mut outcome = Outcome::default();
+    let mut places: Vec<(PoseId, u32)> = Vec::new();
+    for &edge in &job.edges {
+        let source = context.primary.edge(edge).from;
+        let place = places.iter().find(|(pose, _)| *pose == source).map(|(_, place)| *place);
+        let (parent, state) = match place {
+            Some(place) => (Local::New(place), &outcome.states[place as usize]),
+            None => (Local::Known(start), &from),
+        };
+        let depth = outcome.states.len() as u32;
+        let state = simulate(context, simulator, state, (edge, depth), &mut outcome.quality)?;
+        if context.plan.is_tree(edge) {
+            places.push((context.primary.edge(edge).to, depth));
+        }
+        outcome.frames.push(LocalFrame { parent, edge, merge: None });
+        outcome.states.push(state);
+    }
+    Ok(outcome)
+}
+
+/// Undoes the merge of the dead end `start`: simulates on from it along every out-edge, breadth
+/// first, until near a known state or at full depth, then merges the new dead ends.
+///
+/// # Errors
+/// A frame could not be simulated, a state not read, or the job was dropped.
+pub fn expand(
+    context: &Context<'_>,
+    simulator: &mut dyn Simulator,
+    start: StateId,
+    start_pose: PoseId,
+) -> Result<Outcome, JobError> {
+    let root = Node {
+        parent: None,
+        edge: EdgeId(0),
+        pose: start_pose,
+        depth: 0,
+        state: context.states.read(start)?,
+        interior: true,
+    };
+    let mut tree = Tree { start, nodes: vec![root], quality: FrameQuality::default() };
+    let mut queue = VecDeque::from([0]);
+    while let Some(parent) = queue.pop_front() {
+        let pose = tree.nodes[parent].pose;
+        // Whatever is queued is interior and must be expanded, so room is kept for it.
+        for edge in context.primary.out_edges(pose) {
+            let child = tree.step(context, simulator, (parent, edge))?;
+            let waiting: usize = queue.iter().map(|&n| tree.degree(context, n)).sum();
+            let rest = context.primary.out_degree(pose);
+            let room = tree.nodes.len() + waiting + rest + tree.degree(context, child);
+            let node = &tree.nodes[child];
+            let deep = node.depth >= context.rules.depth_frames || room > JOB_STATES_MAX;
+            if !deep && !tree.is_near_known(context, child)? {
+                tree.nodes[child].interior = true;
+                queue.push_back(child);
+            }
+        }
+    }
+    tree.into_outcome(context)
+}
+
+/// A state of an expansion; node 0 is the start.
+struct Node {
+    parent: Option<usize>,
+    edge: EdgeId,
+    pose: PoseId,
+    depth: u32,
+    state: GridState,
+    interior: bool,
+}
+
+struct Tree {
+    start: StateId,
+    nodes: Vec<Node>,
+    quality: FrameQuality,
+}
+
+impl Tree {
+    fn degree(&self, context: &Context<'_>, node: usize) -> usize {
+        context.primary.out_degree(self.nodes[node].pose)
+    }
+
+    fn step(
+        &mut self,
+        context: &Context<'_>,
+        simulator: &mut dyn Simulator,
+        (parent, edge): (usize, EdgeId),
+    ) -> Result<usize, JobError> {
+        let from = &self.nodes[parent];
+        let depth = from.depth + 1;
+        let state = simulate(context, simulator, &from.state, (edge, depth), &mut self.quality)?;
+        let pose = context.primary.edge(edge).to;
+        let parent = Some(parent);
+        self.nodes.push(Node { parent, edge, pose, depth, state, interior: false });
+        Ok(self.nodes.len() - 1)
+    }
+
+    /// Whether a node may stop early: a known interior state, or one of its own tree, is near.
+    fn is_near_known(&self, context: &Context<'_>, node: usize) -> io::Result<bool> {
+        if context.rules.paper {
+            return Ok(false);
+        }
+        Ok(self.most_similar(context, node, context.rules.tolerance_m)?.is_some())
+    }
+
+    /// The paper's FindMostSimilar, among the snapshot and this tree.
+    fn most_similar(
+        &self,
+        context: &Context<'_>,
+        node: usize,
+        bound_m: f32,
+    ) -> io::Result<Option<(Target, f32)>> {
+        let Node { pose, state, .. } = &self.nodes[node];
+        let metric = &context.rules.metric;
+        let known = &context.known[pose.index()];
+        let mut best = nearest(context.states, metric, state, known, bound_m)?
+            .map(|(id, error_m)| (Target::Known(id), error_m));
+        for (own, other) in self.nodes.iter().enumerate() {
+            if !other.interior || other.pose != *pose || own == node {
+                continue;
+            }
+            let bound_m = best.map_or(bound_m, |(_, error_m)| error_m);
+            let error_m = metric.distance_within(state, &other.state, bound_m);
+            if let Some(error_m) = error_m.filter(|e| best.is_none_or(|(_, least)| *e < least)) {
+                best = Some((Target::Node(own), error_m));
+            }
+        }
+        Ok(best)
+    }
+
+    /// Nodes in the order in which they get ids: chain by chain, the longest way first.
+    fn chains(&self) -> Vec<usize> {
+        let mut height = vec![0; self.nodes.len()];
+        let mut heavy: Vec<Option<usize>> = vec![None; self.nodes.len()];
+        for node in (1..self.nodes.len()).rev() {
+            let parent = self.nodes[node].parent.expect("only the start has no parent");
+            // From the back: of equal heights the first child is the last to get here.
+            if height[node] + 1 >= height[parent] {
+                height[parent] = height[node] + 1;
+                heavy[parent] = Some(node);
+            }
+        }
+        let mut order = Vec::with_capacity(self.nodes.len() - 1);
+        for node in 1..self.nodes.len() {
+            let parent = self.nodes[node].parent.expect("only the start has no parent");
+            if parent != 0 && heavy[parent] == Some(node) {
+                continue;
+            }
+            let mut next = Some(node);
+            while let Some(node) = next {
+                order.push(node);
+                next = heavy[node];
+            }
+        }
+        order
+    }
+
+    fn into_outcome(mut self, context: &Context<'_>) -> Result<Outcome, JobError> {
+        let order = self.chains();
+        let mut place = vec![Local::Known(self.start); self.nodes.len()];
+        for (index, &node) in order.iter().enumerate() {
+            place[node] = Local::New(index as u32);
+        }
+        let mut outcome = Outcome { quality: self.quality, ..Outcome::default() };
+        for &node in &order {
+            let merge = if self.nodes[node].interior {
+                None
+            } else {
+                let (target, error_m) = self
+                    .most_similar(context, node, f32::INFINITY)?
+                    .expect("every pose has an interior state since the initial pass");
+                let target = match target {
+                    Target::Known(id) => Local::Known(id),
+                    Target::Node(own) => place[own],
+                };
+                Some((target, error_m))
+            };
+            let Node { parent, edge, .. } = self.nodes[node];
+            let parent = place[parent.expect("only the start has no parent")];
+            outcome.frames.push(LocalFrame { parent, edge, merge });
+        }
+        for &node in &order {
+            let empty = GridState { positions: Vec::new(), velocities: Vec::new() };
+            outcome.states.push(std::mem::replace(&mut self.nodes[node].state, empty));
+        }
+        Ok(outcome)
+    }
+}
+
+#[derive(Clone, Copy)]
+enum Target {
+    Known(StateId),
+    Node(usize),
+}
+
+fn simulate(
+    context: &Context<'_>,
+    simulator: &mut dyn Simulator,
+    state: &GridState,
+    (edge, depth): (EdgeId, u32),
+    quality: &mut FrameQuality,
+) -> Result<GridState, JobError> {
+    if context.abandon.load(Ordering::Relaxed) {
+        return Err(JobError::Abandoned);
+    }
+    let failed = |source| JobError::Simulate { edge, depth, source };
+    let frame = simulator.step(state, edge).map_err(failed)?;
+    if frame.state.vertex_count() != context.states.vertex_count()
+        || frame.state.velocities.len() != context.states.vertex_count()
+    {
+        let text = format!("{} vertices returned", frame.state.vertex_count());
+        return Err(failed(SimulateError(text)));
+    }
+    quality.add(&frame.quality);
+    Ok(frame.state)
+}

@@ -1,0 +1,325 @@
+//! The graph and all bookkeeping of an exploration, as a pure function of the records.
+//!
+//! The same [`Ledger::apply`] serves a running exploration and the replay of its journal, so a
+//! resumed run knows exactly what an uninterrupted one knows, half-finished rounds included.
+
+use std::cmp::Reverse;
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use protocol::{PoseId, StateId};
+
+use super::graph::{Graph, GraphError, Kind};
+use super::plan::Plan;
+use super::record::{FailedRecord, JobRecord, MergeRecord, PublishRecord, Record};
+use crate::primary::PrimaryGraph;
+use crate::scene::Scene;
+use crate::simulator::FrameQuality;
+
+/// A job of a round.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Job {
+    /// A job of the initial pass, by its place in the plan.
+    Initial(usize),
+    /// Undo the merge of this dead end and simulate on from it.
+    Expand(StateId),
+}
+
+/// Jobs chosen from one snapshot of the graph.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Round {
+    /// Counted from 0.
+    pub number: u64,
+    /// The commit it was chosen at.
+    pub snapshot: u64,
+    /// In the order in which they are committed.
+    pub jobs: Vec<Job>,
+    /// How many of them were committed or given up.
+    pub done: usize,
+}
+
+impl Round {
+    /// Whether all its jobs are done.
+    pub fn is_done(&self) -> bool {
+        self.done == self.jobs.len()
+    }
+}
+
+/// What comes next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Phase {
+    /// State 0 is to be draped.
+    Drape,
+    /// Edges of the primary graph are to be simulated for the first time.
+    Initial,
+    /// The initial dead ends are to be merged.
+    Merge,
+    /// Dead ends are to be expanded.
+    Expansion,
+}
+
+/// A record that does not follow from those before it.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum LedgerError {
+    /// The graph refuses it.
+    #[error(transparent)]
+    Graph(#[from] GraphError),
+    /// It is out of turn.
+    #[error("a record of {0} is out of turn")]
+    OutOfTurn(&'static str),
+}
+
+/// See the module.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ledger {
+    graph: Graph,
+    plan: Arc<Plan>,
+    round_jobs: usize,
+    draped: bool,
+    /// The state of each pose that the initial pass keeps interior.
+    placed: Vec<Option<StateId>>,
+    planned_done: Vec<bool>,
+    round: Round,
+    set_aside: BTreeSet<StateId>,
+    quality: FrameQuality,
+    published: Option<PublishRecord>,
+}
+
+impl Ledger {
+    /// Of a folder in which nothing was recorded yet.
+    pub fn new(scene: &Scene) -> Self {
+        let primary: &Arc<PrimaryGraph> = &scene.primary;
+        let plan = Plan::new(primary, scene.start);
+        let mut placed = vec![None; primary.poses().len()];
+        placed[scene.start.index()] = Some(StateId(0));
+        Self {
+            graph: Graph::new(Arc::clone(primary), scene.start),
+            planned_done: vec![false; plan.jobs().len()],
+            plan: Arc::new(plan),
+            round_jobs: scene.exploration.round_jobs.max(1) as usize,
+            draped: false,
+            placed,
+            round: Round { number: 0, snapshot: 0, jobs: Vec::new(), done: 0 },
+            set_aside: BTreeSet::new(),
+            quality: FrameQuality::default(),
+            published: None,
+        }
+    }
+
+    /// The secondary graph.
+    pub fn graph(&self) -> &Graph {
+        &self.graph
+    }
+
+    /// The plan of the initial pass.
+    pub fn plan(&self) -> &Arc<Plan> {
+        &self.plan
+    }
+
+    /// The round that is open, or the last that was.
+    pub fn round(&self) -> &Round {
+        &self.round
+    }
+
+    /// Measures of all frames so far, the drape's included.
+    pub fn quality(&self) -> &FrameQuality {
+        &self.quality
+    }
+
+    /// Dead ends whose job was given up: they stay merged and are not chosen again.
+    pub fn set_aside(&self) -> &BTreeSet<StateId> {
+        &self.set_aside
+    }
+
+    /// The last version known to be in the store.
+    pub fn published(&self) -> Option<PublishRecord> {
+        self.published
+    }
+
+    /// What comes next.
+    pub fn phase(&self) -> Phase {
+        if !self.draped {
+            Phase::Drape
+        } else if self.planned_done.contains(&false) {
+            Phase::Initial
+        } else if self.graph.initialised().is_none() {
+            Phase::Merge
+        } else {
+            Phase::Expansion
+        }
+    }
+
+    /// The interior state of a pose of the initial pass, once simulated.
+    pub fn placed(&self, pose: PoseId) -> Option<StateId> {
+        self.placed[pose.index()]
+    }
+
+    /// Interior states by pose, as they were at a commit, by id.
+    pub fn interior_at(&self, commit: u64) -> Vec<Vec<StateId>> {
+        let mut interior = vec![Vec::new(); self.placed.len()];
+        for (id, state) in self.graph.states().iter().enumerate() {
+            if state.interior_since.is_some_and(|since| since <= commit) {
+                interior[state.pose.index()].push(StateId(id as u64));
+            }
+        }
+        interior
+    }
+
+    /// Chooses the jobs of the next round; false where there is nothing to do.
+    pub fn open_round(&mut self) -> bool {
+        assert!(self.round.is_done(), "the round before is not done");
+        let jobs = match self.phase() {
+            Phase::Initial => self.ready(),
+            Phase::Expansion => self.largest(),
+            Phase::Drape | Phase::Merge => Vec::new(),
+        };
+        if jobs.is_empty() {
+            return false;
+        }
+        let number = if self.round.jobs.is_empty() { 0 } else { self.round.number + 1 };
+        self.round = Round { number, snapshot: self.graph.commit(), jobs, done: 0 };
+        true
+    }
+
+    /// Applies one record.
+    ///
+    /// # Errors
+    /// The record does not follow from those before it; the ledger is of no use any more.
+    pub fn apply(&mut self, record: &Record) -> Result<(), LedgerError> {
+        match record {
+            Record::Header(_) => Err(LedgerError::OutOfTurn("the header")),
+            Record::Drape(quality) if !self.draped => {
+                self.draped = true;
+                self.quality.add(quality);
+                Ok(())
+            }
+            Record::Drape(_) => Err(LedgerError::OutOfTurn("the drape")),
+            Record::Job(job) => self.apply_job(job),
+            Record::Failed(failed) => self.apply_failure(failed),
+            Record::Initialised(merges) => self.apply_initial_merges(merges),
+            Record::Published(version) => {
+                self.published = Some(*version);
+                Ok(())
+            }
+        }
+    }
+
+    /// Initial jobs whose start is known, the most urgent first.
+    fn ready(&self) -> Vec<Job> {
+        let jobs = self.plan.jobs();
+        let ready = |job: &usize| {
+            !self.planned_done[*job] && self.placed[jobs[*job].start.index()].is_some()
+        };
+        let mut ready: Vec<usize> = (0..jobs.len()).filter(ready).collect();
+        ready.sort_by_key(|job| (Reverse(jobs[*job].height), *job));
+        ready.into_iter().take(self.round_jobs).map(Job::Initial).collect()
+    }
+
+    /// Dead ends with the largest merge errors above 0.
+    fn largest(&self) -> Vec<Job> {
+        let queue = self.graph.queue().iter().take_while(|(_, error_m)| *error_m > 0.0);
+        let free = queue.filter(|(state, _)| !self.set_aside.contains(state));
+        free.take(self.round_jobs).map(|(state, _)| Job::Expand(state)).collect()
+    }
+
+    /// The job whose turn it is, if it is the one that was recorded.
+    fn turn(&mut self, round: u64, index: u32, start: StateId) -> Result<Job, LedgerError> {
+        if self.round.is_done() {
+            self.open_round();
+        }
+        let at_turn = self.round.number == round && self.round.done == index as usize;
+        let job = self.round.jobs.get(self.round.done).copied();
+        let expected = match job {
+            Some(Job::Initial(job)) => self.placed[self.plan.jobs()[job].start.index()],
+            Some(Job::Expand(state)) => Some(state),
+            None => None,
+        };
+        match job {
+            Some(job) if at_turn && expected == Some(start) => Ok(job),
+            _ => Err(LedgerError::OutOfTurn("a job")),
+        }
+    }
+
+    fn apply_job(&mut self, record: &JobRecord) -> Result<(), LedgerError> {
+        match self.turn(record.round, record.index, record.start)? {
+            Job::Initial(job) => self.apply_initial(job, record)?,
+            Job::Expand(start) => self.apply_expansion(start, record)?,
+        }
+        self.quality.add(&record.quality);
+        self.round.done += 1;
+        Ok(())
+    }
+
+    fn apply_initial(&mut self, job: usize, record: &JobRecord) -> Result<(), LedgerError> {
+        let plan = Arc::clone(&self.plan);
+        let planned = &plan.jobs()[job].edges;
+        if !planned.iter().eq(record.frames.iter().map(|frame| &frame.edge)) {
+            return Err(LedgerError::OutOfTurn("other edges than planned"));
+        }
+        for frame in &record.frames {
+            let state = self.graph.attach(frame.parent, frame.edge)?;
+            if plan.is_tree(frame.edge) {
+                self.placed[self.graph.state(state).pose.index()] = Some(state);
+            }
+        }
+        let parents: BTreeSet<StateId> = record.frames.iter().map(|frame| frame.parent).collect();
+        for parent in parents {
+            let whole = match &self.graph.state(parent).kind {
+                Kind::Open { next } => next.iter().all(Option::is_some),
+                _ => false,
+            };
+            if whole {
+                self.graph.close(parent)?;
+            }
+        }
+        self.graph.end_commit();
+        self.planned_done[job] = true;
+        Ok(())
+    }
+
+    fn apply_expansion(&mut self, start: StateId, job: &JobRecord) -> Result<(), LedgerError> {
+        self.graph.revert(start)?;
+        let first = self.graph.next_id().0;
+        for frame in &job.frames {
+            self.graph.attach(frame.parent, frame.edge)?;
+        }
+        let new = || job.frames.iter().zip(first..).map(|(frame, id)| (frame, StateId(id)));
+        self.graph.close(start)?;
+        for (_, state) in new().filter(|(frame, _)| frame.merge.is_none()) {
+            self.graph.close(state)?;
+        }
+        for (frame, state) in new() {
+            if let Some((target, error_m)) = frame.merge {
+                self.graph.merge(state, target, error_m)?;
+            }
+        }
+        for merge in &job.remerges {
+            self.graph.remerge(merge.state, merge.target, merge.error_m)?;
+        }
+        self.graph.check_total()?;
+        self.graph.end_commit();
+        Ok(())
+    }
+
+    fn apply_failure(&mut self, failed: &FailedRecord) -> Result<(), LedgerError> {
+        match self.turn(failed.round, failed.index, failed.start)? {
+            Job::Initial(_) => Err(LedgerError::OutOfTurn("a failure of the initial pass")),
+            Job::Expand(start) => {
+                self.set_aside.insert(start);
+                self.round.done += 1;
+                Ok(())
+            }
+        }
+    }
+
+    fn apply_initial_merges(&mut self, merges: &[MergeRecord]) -> Result<(), LedgerError> {
+        if self.phase() != Phase::Merge {
+            return Err(LedgerError::OutOfTurn("the end of the initial pass"));
+        }
+        for merge in merges {
+            self.graph.merge(merge.state, merge.target, merge.error_m)?;
+        }
+        Ok(self.graph.end_initial_pass()?)
+    }
+}
