@@ -4,7 +4,8 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use protocol::VersionNumber;
+use object_store::ObjectStore;
+use protocol::{SigningKey, VersionNumber};
 use serde::Serialize;
 
 use crate::grow::graph::Graph;
@@ -13,6 +14,7 @@ use crate::grow::ledger::Phase;
 use crate::grow::record::PublishRecord;
 use crate::grow::round::{self, Ended, RoundError};
 use crate::grow::work::{Work, WorkError};
+use crate::pack::{EncodeSettings, PublishError, Publisher};
 use crate::scene::Scene;
 use crate::simulator::{FrameQuality, SimulateError, Simulator, SimulatorFactory};
 use crate::view::GraphView;
@@ -147,7 +149,7 @@ pub enum ExploreError {
     Drape(SimulateError),
     /// A version could not be published.
     #[error("publishing: {0}")]
-    Publish(#[source] Box<dyn std::error::Error + Send + Sync>),
+    Publish(#[from] PublishError),
     /// The store holds states that the work folder does not know.
     #[error(
         "the store holds {stored} states of this garment, the work folder {} only {known}: give \
@@ -163,34 +165,88 @@ pub enum ExploreError {
     },
 }
 
+/// Where an exploration reads and writes.
+#[derive(Clone)]
+pub struct Place {
+    /// Where versions are published.
+    pub store: Arc<dyn ObjectStore>,
+    /// Signs them; the same for every run on a store.
+    pub key: SigningKey,
+    /// The work folder: exact states and the journal. Made if it is missing.
+    pub work: PathBuf,
+}
+
+/// Explores a scene until `options` say otherwise, from wherever the work folder stands:
+///
+/// 1. drapes the garment on the start pose and simulates every primary edge once;
+/// 2. merges the dead ends and publishes the first version;
+/// 3. for ever: expands the dead ends with the largest errors, round after round, and publishes
+///    at fixed counts of simulated frames.
+///
+/// Killed at any instant and called again, it ends with the same work folder and the same store as
+/// if it had not been. The future blocks its thread while it simulates and is not `Send`: give it
+/// a thread of its own, e.g. with a current-thread runtime.
+///
+/// # Errors
+/// The work folder or the store refuses, or the initial pass cannot be simulated. A job of an
+/// expansion that cannot be simulated is no error: see [`Progress::failure`].
+pub async fn explore(
+    scene: &Scene,
+    simulators: &dyn SimulatorFactory,
+    place: &Place,
+    options: &ExploreOptions,
+    progress: &mut dyn FnMut(&Progress),
+) -> Result<Summary, ExploreError> {
+    let work = Work::open(&place.work, scene, options.paper)?;
+    let settings = EncodeSettings::for_rank(usize::from(scene.exploration.rank_max));
+    let (store, key) = (Arc::clone(&place.store), place.key.clone());
+    let publisher = Publisher::open(store, scene, key, settings).await?;
+    let mut publisher = Garment(publisher, &scene.garment.name);
+    let setup = Setup { scene, simulators, work: &place.work, options };
+    run(setup, work, &mut publisher, progress).await
+}
+
 /// Where versions go. Publishing what the head shows already makes no version.
-pub(crate) trait Publish {
+trait Publish {
     /// The head's number, and how many states of this garment the store holds.
     fn head(&self) -> (Option<VersionNumber>, u64);
 
     /// Makes the graph the head; says its number.
-    async fn publish(
-        &mut self,
-        view: &dyn GraphView,
-    ) -> Result<VersionNumber, Box<dyn std::error::Error + Send + Sync>>;
+    async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError>;
+}
+
+/// The store's publisher, for the garment of this name.
+struct Garment<'a>(Publisher, &'a str);
+
+impl Publish for Garment<'_> {
+    fn head(&self) -> (Option<VersionNumber>, u64) {
+        let Some(head) = self.0.head() else { return (None, 0) };
+        let last = head.garment(self.1).and_then(|garment| garment.regions.last());
+        let stored = last.map_or(0, |last| last.first_state.0 + u64::from(last.state_count));
+        (Some(head.number), stored)
+    }
+
+    async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError> {
+        Ok(self.0.publish(view).await?.number)
+    }
 }
 
 /// What is explored, and from what.
-pub(crate) struct Setup<'a> {
-    pub scene: &'a Scene,
-    pub simulators: &'a dyn SimulatorFactory,
-    pub work: &'a Path,
-    pub options: &'a ExploreOptions,
+struct Setup<'a> {
+    scene: &'a Scene,
+    simulators: &'a dyn SimulatorFactory,
+    work: &'a Path,
+    options: &'a ExploreOptions,
 }
 
-/// The exploration, whatever the store. Blocks its thread while it simulates.
-pub(crate) async fn run(
+/// The exploration, whatever the store.
+async fn run(
     setup: Setup<'_>,
+    mut work: Work,
     publisher: &mut impl Publish,
     progress: &mut dyn FnMut(&Progress),
 ) -> Result<Summary, ExploreError> {
     let Setup { scene, options, .. } = setup;
-    let mut work = Work::open(setup.work, scene, options.paper)?;
     let (head, stored) = publisher.head();
     let known = work.graph().next_id().0;
     if stored > known {
@@ -262,7 +318,7 @@ async fn publish(
     publisher: &mut impl Publish,
     shown: u64,
 ) -> Result<(), ExploreError> {
-    let number = publisher.publish(&work.view(shown)).await.map_err(ExploreError::Publish)?;
+    let number = publisher.publish(&work.view(shown)).await?;
     let commit = work.graph().commit();
     Ok(work.published(PublishRecord { number, commit, shown })?)
 }

@@ -1,6 +1,9 @@
 //! Whole explorations with toy simulators and a store in memory: any number of workers, killed
 //! anywhere, with and without `--paper`.
 
+// Figures are compared with where they come from: equal means equal.
+#![allow(clippy::float_cmp)]
+
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use protocol::links::LinkEntry;
@@ -31,15 +34,12 @@ impl Publish for Memory {
         ((number > 0).then_some(VersionNumber(number)), states as u64)
     }
 
-    async fn publish(
-        &mut self,
-        view: &dyn GraphView,
-    ) -> Result<VersionNumber, Box<dyn std::error::Error + Send + Sync>> {
+    async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError> {
         let links = view.links();
         let mut positions = vec![0.0; 3 * view.vertex_count()];
         let mut first_coordinates = Vec::new();
         for id in 0..links.len() as u64 {
-            view.positions(StateId(id), &mut positions)?;
+            view.positions(StateId(id), &mut positions).unwrap();
             first_coordinates.push(positions[0]);
         }
         check_total(view, &links);
@@ -92,7 +92,8 @@ fn explore(
     options: &ExploreOptions,
 ) -> Result<Summary, ExploreError> {
     let setup = Setup { scene, simulators: toy, work: folder, options };
-    block_on(run(setup, store, &mut |_| {}))
+    let work = Work::open(folder, scene, options.paper)?;
+    block_on(run(setup, work, store, &mut |_| {}))
 }
 
 fn block_on<T>(future: impl Future<Output = T>) -> T {
@@ -125,7 +126,7 @@ fn one_two_and_four_workers_write_the_same_bytes() {
     }
 }
 
-/// Kills at every byte of the journal, in turn with and without the last version in the store.
+/// Cuts the journal all along its length, with and without the version after in the store.
 #[test]
 fn killed_anywhere_it_goes_on_to_the_same_files_and_versions() {
     let (scene, toy, options) = (toy_scene(), Toy::new(150), options(160));
@@ -136,7 +137,7 @@ fn killed_anywhere_it_goes_on_to_the_same_files_and_versions() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name| folder.path().join(name);
     let header_end = 12 + u32::from_le_bytes(journal[8..12].try_into().unwrap()) as usize + 8;
-    for cut in (header_end..journal.len()).step_by(7) {
+    for cut in (header_end..journal.len()).step_by(13) {
         std::fs::write(path("journal"), &journal[..cut]).unwrap();
         std::fs::write(path("states"), &states).unwrap();
         // What the store held then: every version on record, and perhaps the one after.
@@ -319,8 +320,9 @@ fn an_edge_that_fails_costs_its_jobs_only() {
     let options = ExploreOptions { workers: 2, ..options(150) };
     let setup =
         Setup { scene: &scene, simulators: &broken, work: folder.path(), options: &options };
+    let work = Work::open(folder.path(), &scene, false).unwrap();
     let mut count = |progress: &Progress| failures += u64::from(progress.failure.is_some());
-    let summary = block_on(run(setup, &mut store, &mut count)).unwrap();
+    let summary = block_on(run(setup, work, &mut store, &mut count)).unwrap();
     assert!(failures > 0);
     assert_eq!(summary.failed_jobs, failures);
     let work = Work::open(folder.path(), &scene, false).unwrap();
@@ -360,4 +362,54 @@ fn other_inputs_other_stores_and_second_explorers_are_refused() {
     std::fs::write(folder.path().join("journal"), b"a diary").unwrap();
     let error = explore(&scene, &toy, (folder.path(), &mut store), &options(60)).unwrap_err();
     assert!(error.to_string().contains("not a journal"), "{error}");
+}
+
+/// Every file below a folder, by path, but the work folder's.
+fn tree(root: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = std::collections::BTreeMap::new();
+    let mut folders = vec![root.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                let name = path.strip_prefix(root).unwrap().to_owned();
+                found.insert(name, std::fs::read(path).unwrap());
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn the_published_store_is_equal_for_any_workers_and_after_any_stop() {
+    let mut first = None;
+    for (workers, patience) in [(1, u64::MAX), (2, u64::MAX), (2, 4)] {
+        let (scene, toy) = (toy_scene(), Toy::new(150));
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("store");
+        std::fs::create_dir(&root).unwrap();
+        let summary = (0..500).find_map(|_| {
+            let place = Place {
+                store: crate::pack::local_store(&root).unwrap(),
+                key: SigningKey::from_seed(&[7; 32]),
+                work: folder.path().join("work"),
+            };
+            let asked = AtomicU64::new(0);
+            let should_stop = Arc::new(move || asked.fetch_add(1, Ordering::Relaxed) >= patience);
+            let options = ExploreOptions { workers, should_stop, ..options(200) };
+            let mut quiet = |_: &Progress| {};
+            let future = super::explore(&scene, &toy, &place, &options, &mut quiet);
+            let summary = block_on(future).unwrap();
+            (summary.end == End::Frames).then_some(summary)
+        });
+        let versions = summary.expect("it gets there").version;
+        assert!(versions >= 3, "{versions}");
+        let found = tree(&root);
+        assert!(found.len() > versions as usize);
+        let expected = first.get_or_insert_with(|| found.clone());
+        assert!(expected.keys().eq(found.keys()), "{workers} workers, {patience}");
+        assert!(*expected == found, "{workers} workers, {patience}");
+    }
 }

@@ -221,7 +221,7 @@ mod tests {
             std::fs::write(&path, &torn).unwrap();
             assert_eq!(read(&path).unwrap().0, [record(0), record(1)]);
         }
-        let mut damaged = bytes.clone();
+        let mut damaged = bytes;
         damaged[8 + size + 6] ^= 1;
         std::fs::write(&path, &damaged).unwrap();
         let error = read(&path).unwrap_err();

@@ -82,6 +82,8 @@ fn squared_max(a: &[[i16; 3]], b: &[[i16; 3]]) -> u64 {
 }
 
 #[cfg(test)]
+// The grid is exact: equal means equal.
+#[allow(clippy::float_cmp)]
 mod tests {
     use super::*;
     use proptest::prelude::*;

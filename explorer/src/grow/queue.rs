@@ -66,6 +66,6 @@ mod tests {
         assert_eq!(order, [7, 2, 4, 1, 9]);
         queue.remove(StateId(7), 3.0);
         queue.remove(StateId(9), -0.0);
-        assert_eq!((queue.worst_m(), queue.len()), (0.5, 3));
+        assert_eq!((queue.worst_m().to_bits(), queue.len()), (0.5f32.to_bits(), 3));
     }
 }

@@ -106,9 +106,9 @@ impl Header {
         let text = |name: &str, value: String| (name.to_owned(), value);
         let inputs = vec![
             text("scene", scene.name.clone()),
-            text("character", digest(character(scene))),
-            text("motion graph", digest(motion(scene))),
-            text("garment", digest(garment(scene))),
+            text("character", digest(&character(scene))),
+            text("motion graph", digest(&motion(scene))),
+            text("garment", digest(&garment(scene))),
             text("start pose", scene.start.to_string()),
             text("velocity_time_s", e.velocity_time_s.to_string()),
             text("tolerance_m", e.tolerance_m.to_string()),
@@ -143,7 +143,7 @@ impl Header {
 }
 
 /// The first 16 digits of a BLAKE3 hash over all bits of an input.
-fn digest(hasher: Hasher) -> String {
+fn digest(hasher: &Hasher) -> String {
     hasher.0.finalize().to_hex()[..16].to_owned()
 }
 

@@ -9,7 +9,7 @@
 //! | 64 + id x 12 x vertices | 12 x vertices | positions, then velocities: i16 little-endian |
 //!
 //! Only appended to. What lies beyond the last state of the journal was never reported as done
-//! and is overwritten. Reads are positioned; the operating system's page cache is the cache.
+//! and is cut off when the file is opened. Reads are positioned; the operating system's page cache is the cache.
 
 use std::fs::File;
 use std::io;
@@ -41,7 +41,7 @@ impl StateFile {
         Ok(Self { file, vertex_count: vertex_count as usize })
     }
 
-    /// Opens the file of `states` states.
+    /// Opens the file of `states` states; cuts off what lies beyond them.
     ///
     /// # Errors
     /// The file cannot be read, is another file, or holds fewer states.
@@ -64,6 +64,7 @@ impl StateFile {
             let text = format!("{length} bytes long, but the journal speaks of {needed}");
             return Err(io::Error::other(text));
         }
+        file.file.set_len(needed)?;
         Ok(file)
     }
 
@@ -124,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn states_come_back_and_stale_ones_are_overwritten() {
+    fn states_come_back_and_stale_ones_are_cut_off() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("states");
         let file = StateFile::create(&path, 2, &[5; 32]).unwrap();
@@ -134,8 +135,8 @@ mod tests {
         let file = StateFile::open(&path, 2, &[5; 32], 2).unwrap();
         assert_eq!(file.read(StateId(0)).unwrap(), state(1));
         assert_eq!(file.read(StateId(1)).unwrap(), state(9));
-        assert!(file.read(StateId(3)).is_err());
-        assert_eq!(std::fs::metadata(&path).unwrap().len(), 64 + 3 * 24);
+        assert!(file.read(StateId(2)).is_err());
+        assert_eq!(std::fs::metadata(&path).unwrap().len(), 64 + 2 * 24);
     }
 
     #[test]

@@ -31,7 +31,10 @@ use crate::simulator::Frame;
 #[non_exhaustive]
 pub enum WorkError {
     /// A file could not be read or written, e.g. because the disk is full.
-    #[error("{}: {source}; what was reported as done is safe: mend this and run again", .path.display())]
+    #[error(
+        "{}: {source}; what was reported as done is safe: mend this and run again",
+        .path.display()
+    )]
     Io {
         /// Which file.
         path: PathBuf,
@@ -39,10 +42,16 @@ pub enum WorkError {
         source: io::Error,
     },
     /// Another explorer has it open.
-    #[error("{}: another explorer is at work in this folder; stop it or take another one", .0.display())]
+    #[error(
+        "{}: another explorer is at work in this folder; stop it or take another one",
+        .0.display()
+    )]
     Locked(PathBuf),
     /// The journal was made for something else.
-    #[error("{}: made for other inputs: {differences}; take these back or another work folder", .path.display())]
+    #[error(
+        "{}: made for other inputs: {differences}; take these back or another work folder",
+        .path.display()
+    )]
     Mismatch {
         /// The journal.
         path: PathBuf,
