@@ -8,8 +8,9 @@
 //! Map: [`ids`]; [`limits`]; [`scene`] the scene and garment chunks; [`region`] the container of
 //! encoded regions; [`links`] which state follows which, [`table`] all of it, proved total;
 //! [`manifest`] a version, [`difference`] what changed since another, [`sign`] who published it;
-//! [`store`] where things lie in an object store; [`message`] what is said on a connection and
-//! [`frame`] how it is cut; [`session`] the two sides of the conversation.
+//! [`telemetry`] what players walked; [`store`] where things lie in an object store; [`message`]
+//! what is said on a connection and [`frame`] how it is cut; [`session`] the two sides of the
+//! conversation.
 //!
 //! ```
 //! use protocol::{ChunkHash, scene::GarmentChunk};
@@ -35,6 +36,7 @@ pub mod session;
 pub mod sign;
 pub mod store;
 pub mod table;
+pub mod telemetry;
 mod wire;
 
 pub use difference::ManifestDifference;

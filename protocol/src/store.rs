@@ -22,9 +22,23 @@ pub fn version_path(number: VersionNumber) -> String {
     format!("{VERSIONS}/{:020}", number.0)
 }
 
+/// `telemetry/00000000000000000001`: a [`TelemetryBatch`](crate::telemetry::TelemetryBatch).
+pub fn telemetry_path(number: u64) -> String {
+    format!("{TELEMETRY}/{number:020}")
+}
+
+/// The number in a telemetry batch's path, or `None` for another file.
+pub fn telemetry_of_path(path: &str) -> Option<u64> {
+    numbered(path, TELEMETRY)
+}
+
 /// The number in a manifest's path, or `None` for another file.
 pub fn version_of_path(path: &str) -> Option<VersionNumber> {
-    let name = path.strip_prefix(VERSIONS)?.strip_prefix('/')?;
+    numbered(path, VERSIONS).map(VersionNumber)
+}
+
+fn numbered(path: &str, folder: &str) -> Option<u64> {
+    let name = path.strip_prefix(folder)?.strip_prefix('/')?;
     let all_digits = name.len() == 20 && name.bytes().all(|b| b.is_ascii_digit());
-    all_digits.then(|| name.parse().ok().map(VersionNumber))?
+    all_digits.then(|| name.parse().ok())?
 }

@@ -41,7 +41,7 @@ pub enum ServerEvent {
         /// Most urgent first.
         priority: Priority,
     },
-    /// Do not send it, or stop: the answer is [`Server::handle_sent`] all the same.
+    /// Do not send it, or reset its stream. No answer; the chunk may be asked for again.
     Cancel {
         /// The chunk.
         hash: ChunkHash,
@@ -176,7 +176,7 @@ impl Server {
         self.base = held.map_or(Base::Nothing, Base::Held);
     }
 
-    /// A chunk was sent whole, or its sending was given up after a cancel.
+    /// A chunk was sent whole.
     pub fn handle_sent(&mut self, hash: &ChunkHash) {
         self.fetches.remove(hash);
     }
@@ -254,7 +254,7 @@ impl Server {
                 self.events.push_back(ServerEvent::Send { hash, priority });
             }
             (ClientMessage::Cancel { hash }, _) => {
-                if self.fetches.contains(&hash) {
+                if self.fetches.remove(&hash) {
                     self.events.push_back(ServerEvent::Cancel { hash });
                 }
             }

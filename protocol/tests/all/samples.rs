@@ -4,8 +4,10 @@ use protocol::links::{LinkEntry, LinkPage};
 use protocol::manifest::{ChunkRef, GarmentVersion, GenerationRef, RegionChunkRef, VersionStats};
 use protocol::region::{RegionChunk, RegionEntry};
 use protocol::scene::{BodyMesh, Capsule, Edge, GarmentChunk, Joint, Pose, SceneChunk};
+use protocol::telemetry::{GarmentCounts, TelemetryBatch};
 use protocol::{
-    ChunkHash, GarmentId, GenerationId, Manifest, PoseId, SigningKey, StateId, VersionNumber,
+    ChunkHash, EdgeId, GarmentId, GenerationId, Manifest, PoseId, SigningKey, StateId,
+    VersionNumber,
 };
 
 pub fn scene() -> SceneChunk {
@@ -73,6 +75,11 @@ pub fn entries() -> Vec<LinkEntry> {
 
 pub fn page() -> LinkPage {
     LinkPage { first_state: StateId(0), entries: entries() }
+}
+
+pub fn telemetry() -> TelemetryBatch {
+    let edges = vec![(EdgeId(0), 300), (EdgeId(3), 1)];
+    TelemetryBatch { garments: vec![GarmentCounts { garment: GarmentId(0), edges }] }
 }
 
 pub fn chunk(name: u64) -> ChunkRef {

@@ -197,8 +197,8 @@ impl Pair {
                         server.handle_sent(hash);
                     }
                 },
-                ServerEvent::Cancel { hash } => server.handle_sent(hash),
                 ServerEvent::Applied(_)
+                | ServerEvent::Cancel { .. }
                 | ServerEvent::Telemetry { .. }
                 | ServerEvent::Closed { .. } => {}
             }
