@@ -7,8 +7,8 @@ use cloth::{Body, Pose, Quat, Rigid, Skeleton, Vec3};
 use codec::Basis;
 use codec::kim2013::{Generation, Region};
 use explorer::pack::{
-    EncodeSettings, InspectError, PublishError, Publisher, RunsError, StoreError, inspect,
-    local_store,
+    EncodeSettings, InspectError, PublishError, Publisher, RunsError, StoreError,
+    collect_leftovers, inspect, local_store,
 };
 use explorer::primary::{PrimaryEdge, PrimaryGraph, PrimaryPose};
 use explorer::scene::{ExplorationSettings, Fabric, Garment, Scene};
@@ -403,6 +403,23 @@ async fn a_corrupted_chunk_is_named() {
         std::fs::write(&path, &good).unwrap();
     }
     inspect(&*store, None).await.unwrap();
+}
+
+#[tokio::test]
+async fn half_written_files_are_ignored_and_collected() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = local_store(folder.path()).unwrap();
+    open(&store).await.publish(&Ring::new(2)).await.unwrap();
+    let before = contents(&*store).await;
+    for left in ["versions/00000000000000000002#1", "chunks/ab/abcd#12", "publisher.pub#1"] {
+        let path = folder.path().join(left);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, [1, 2, 3]).unwrap();
+    }
+    assert_eq!(inspect(&*store, None).await.unwrap().version.0, 1);
+    assert_eq!(collect_leftovers(folder.path()).unwrap(), 3);
+    assert_eq!(collect_leftovers(folder.path()).unwrap(), 0);
+    assert_eq!(contents(&*store).await, before);
 }
 
 #[tokio::test]

@@ -14,6 +14,11 @@ const REGION_STATES: u32 = limits::REGION_STATES_MAX as u32;
 /// one fetch stays short.
 const CHUNK_BYTES: usize = 256 << 10;
 
+// Neither leaf knows the other; here their limits meet.
+const _: () = assert!(codec::REGION_STATES_MAX == limits::REGION_STATES_MAX);
+const _: () = assert!(codec::COLUMNS_MAX == limits::COLUMNS_MAX);
+const _: () = assert!(codec::ROWS_MAX == 3 * limits::VERTICES_MAX);
+
 /// One region to be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Cut {

@@ -92,6 +92,36 @@ pub fn local_store(folder: &FilePath) -> Result<Arc<dyn ObjectStore>, StoreError
     Ok(Arc::new(local.with_fsync(true)))
 }
 
+/// Removes what a killed writer left in a local store: half-written files (`NAME#1`), which readers
+/// never see. Only for the one process that publishes there, before it does. Returns how many.
+///
+/// # Errors
+/// A folder that cannot be read, or a file that cannot be removed.
+pub fn collect_leftovers(folder: &FilePath) -> std::io::Result<usize> {
+    let mut removed = 0;
+    let mut folders = vec![(folder.to_path_buf(), 0)];
+    while let Some((folder, depth)) = folders.pop() {
+        for entry in std::fs::read_dir(&folder)? {
+            let entry = entry?;
+            if entry.file_type()?.is_dir() {
+                // A store is two levels deep: chunks, and a folder per first byte.
+                if depth < 2 {
+                    folders.push((entry.path(), depth + 1));
+                }
+            } else if is_leftover(&entry.file_name().to_string_lossy()) {
+                std::fs::remove_file(entry.path())?;
+                removed += 1;
+            }
+        }
+    }
+    Ok(removed)
+}
+
+fn is_leftover(name: &str) -> bool {
+    let digits = name.rsplit_once('#').map_or("", |(_, digits)| digits);
+    !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit())
+}
+
 /// Number of the newest version, if any.
 ///
 /// # Errors
