@@ -188,6 +188,11 @@ impl Cache {
         self.initial_bytes + self.streamed_bytes
     }
 
+    /// Bytes that streamed regions may take.
+    pub fn budget_bytes(&self) -> usize {
+        self.budget_bytes
+    }
+
     /// Bytes of the initial graph's regions.
     pub fn initial_bytes(&self) -> usize {
         self.initial_bytes

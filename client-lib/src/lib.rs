@@ -12,7 +12,7 @@
 //! from functions that say so in their name (`wait_*`, `close`); the core knows no network, no
 //! file and no thread ([`walk`], a tool, reads its list from a file); neither explorer nor server is linked.
 //!
-//! Map: [`version`] a version assembled, [`cache`] decoded
+//! Map: `client` connects (feature `driver`); [`loader`] makes versions of chunks; [`version`] a version assembled, [`cache`] decoded
 //! regions, [`shared`] how both reach the frame loop; [`character`] the face, [`blend`] and
 //! [`placement`] under it; [`prefetch`] what is needed next; [`telemetry`] and [`stats`] what was
 //! played; [`scene`] the checked scene, [`walk`] walks over it.
@@ -22,7 +22,12 @@
 pub mod blend;
 pub mod cache;
 pub mod character;
+#[cfg(feature = "driver")]
+pub mod client;
 pub mod clock;
+#[cfg(feature = "driver")]
+mod driver;
+pub mod loader;
 pub mod placement;
 pub mod prefetch;
 pub mod scene;
@@ -36,6 +41,9 @@ pub mod walk;
 mod tiny;
 
 pub use character::{Character, StepOutcome, decode};
+#[cfg(feature = "driver")]
+pub use client::{Client, ClientConfig, ClientError, Status};
+pub use loader::Memory;
 pub use scene::Scene;
 pub use stats::{Histogram, PlayStats};
 pub use walk::{Walk, WalkSpec};

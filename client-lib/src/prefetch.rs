@@ -4,7 +4,7 @@
 //! A pure function of cursors, version and what is resident: equal inputs, equal wants.
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BinaryHeap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashSet};
 
 use protocol::manifest::ChunkRef;
 use protocol::{ChunkHash, EdgeId, StateId};
@@ -49,44 +49,74 @@ impl EdgeWeights {
     }
 }
 
-/// A chunk that a cursor is about to need.
+/// A chunk that lies ahead of a cursor.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Want {
+pub struct Ahead {
     /// The chunk.
     pub chunk: ChunkRef,
     /// The soonest that a cursor can be there, in frames; 0 where one already stands.
     pub frames: u32,
     /// How likely one comes there on that way.
     pub probability: f32,
+    /// Whether all its states that lie ahead are resident.
+    pub resident: bool,
 }
 
-/// A place ahead of a cursor. Ordered by probability, then nearness, then id.
+/// What to do about the chunks ahead.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Plan {
+    /// To be fetched, the most pressing first.
+    pub fetch: Vec<Ahead>,
+    /// Not to be evicted: what is ahead and here, and what will be.
+    pub keep: BTreeSet<ChunkHash>,
+}
+
+/// The most pressing chunks that fit into `budget_bytes` together: the rest would only push each
+/// other out.
+pub fn plan(ahead: &[Ahead], budget_bytes: usize) -> Plan {
+    let mut plan = Plan::default();
+    let mut planned_bytes = 0;
+    for chunk in ahead {
+        planned_bytes += chunk.chunk.bytes as usize;
+        if planned_bytes > budget_bytes && !plan.keep.is_empty() {
+            break;
+        }
+        plan.keep.insert(chunk.chunk.hash);
+        if !chunk.resident {
+            plan.fetch.push(*chunk);
+        }
+    }
+    plan
+}
+
+/// A state ahead of a cursor. Ordered by probability, then nearness, then id.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Ahead {
+struct Place {
     /// Bits of a positive `f32`, which are in the order of the numbers.
     probability: u32,
     frames: Reverse<u32>,
     state: Reverse<StateId>,
 }
 
-/// The chunks that are not resident and lie ahead, the most pressing first.
-pub fn wants(
+/// The streamed chunks that lie ahead, the most pressing first; those of the initial graph only
+/// where they are not resident.
+pub fn ahead(
     version: &Version,
     resident: &Resident,
     cursors: &[StateId],
     weights: &EdgeWeights,
     horizon: &Horizon,
-) -> Vec<Want> {
+) -> Vec<Ahead> {
     let mut found = BTreeMap::new();
     for cursor in cursors {
         let search = Search { version, resident, weights, horizon, found: &mut found };
         search.run(*cursor);
     }
-    let mut wants: Vec<Want> = found.into_values().collect();
+    let mut all: Vec<Ahead> = found.into_values().collect();
     // An unlikely way may wait for as many frames longer as it is less likely.
-    let pressing = |want: &Want| (want.frames as f32 + 1.0) / want.probability;
-    wants.sort_by(|a, b| pressing(a).total_cmp(&pressing(b)).then(a.chunk.hash.cmp(&b.chunk.hash)));
-    wants
+    let pressing = |a: &Ahead| (a.frames as f32 + 1.0) / a.probability;
+    all.sort_by(|a, b| pressing(a).total_cmp(&pressing(b)).then(a.chunk.hash.cmp(&b.chunk.hash)));
+    all
 }
 
 struct Search<'a> {
@@ -94,7 +124,7 @@ struct Search<'a> {
     resident: &'a Resident,
     weights: &'a EdgeWeights,
     horizon: &'a Horizon,
-    found: &'a mut BTreeMap<ChunkHash, Want>,
+    found: &'a mut BTreeMap<ChunkHash, Ahead>,
 }
 
 impl Search<'_> {
@@ -102,8 +132,8 @@ impl Search<'_> {
         let Some(start) = self.version.links().resume(cursor) else { return };
         let mut open = BinaryHeap::new();
         let mut seen = HashSet::new();
-        open.push(Ahead { probability: 1f32.to_bits(), frames: Reverse(0), state: Reverse(start) });
-        while let Some(Ahead { probability, frames, state }) = open.pop() {
+        open.push(Place { probability: 1f32.to_bits(), frames: Reverse(0), state: Reverse(start) });
+        while let Some(Place { probability, frames, state }) = open.pop() {
             let (probability, frames, state) = (f32::from_bits(probability), frames.0, state.0);
             if !seen.insert(state) {
                 continue;
@@ -111,7 +141,7 @@ impl Search<'_> {
             if seen.len() > self.horizon.states_max {
                 break;
             }
-            self.want(state, frames, probability);
+            self.find(state, frames, probability);
             if frames < self.horizon.frames {
                 self.look_on(&mut open, state, frames + 1, probability);
             }
@@ -121,7 +151,7 @@ impl Search<'_> {
     /// Opens the successors of a state.
     fn look_on(
         &mut self,
-        open: &mut BinaryHeap<Ahead>,
+        open: &mut BinaryHeap<Place>,
         state: StateId,
         frames: u32,
         probability: f32,
@@ -136,9 +166,9 @@ impl Search<'_> {
                 continue;
             }
             if let Some((dead_end, _)) = follow.via {
-                self.want(dead_end, frames, probability);
+                self.find(dead_end, frames, probability);
             }
-            open.push(Ahead {
+            open.push(Place {
                 probability: probability.to_bits(),
                 frames: Reverse(frames),
                 state: Reverse(follow.state),
@@ -146,16 +176,18 @@ impl Search<'_> {
         }
     }
 
-    fn want(&mut self, state: StateId, frames: u32, probability: f32) {
-        if self.resident.has(state) {
+    fn find(&mut self, state: StateId, frames: u32, probability: f32) {
+        let Some(region) = self.version.region_chunk(state) else { return };
+        let resident = self.resident.has(state);
+        if resident && region.initial {
             return;
         }
-        let Some(region) = self.version.region_chunk(state) else { return };
         let chunk = region.chunk;
-        let want = Want { chunk, frames, probability };
-        let known = self.found.entry(chunk.hash).or_insert(want);
+        let found = Ahead { chunk, frames, probability, resident };
+        let known = self.found.entry(chunk.hash).or_insert(found);
         known.frames = known.frames.min(frames);
         known.probability = known.probability.max(probability);
+        known.resident &= resident;
     }
 }
 
@@ -165,17 +197,17 @@ mod tests {
     use crate::tiny;
 
     #[test]
-    fn the_chunk_ahead_is_wanted_at_its_distance_and_nothing_that_is_resident() {
+    fn the_chunk_ahead_is_found_at_its_distance_and_the_initial_graph_needs_none() {
         let version = tiny::version(2, tiny::grown_links());
         let view = tiny::view(&version, &[0]);
         let ask = |cursor: u64, weights: &EdgeWeights| {
-            wants(&version, &view.resident, &[StateId(cursor)], weights, &Horizon::default())
+            ahead(&version, &view.resident, &[StateId(cursor)], weights, &Horizon::default())
         };
         // From 0: edge 1 to state 1, then to 3 (resident), then to 4 or 5 in the second chunk.
         let found = ask(0, &EdgeWeights::default());
         assert_eq!(found.len(), 1);
         assert_eq!(found[0].chunk.hash, tiny::region_chunk(1));
-        assert_eq!(found[0].frames, 3);
+        assert_eq!((found[0].frames, found[0].resident), (3, false));
         assert!((found[0].probability - 0.25).abs() < 1e-6, "{found:?}");
         assert_eq!(ask(3, &EdgeWeights::default())[0].frames, 1);
         // Players who always take edge 1 make it likelier.
@@ -183,22 +215,35 @@ mod tests {
         weights.add(EdgeId(1), 8);
         assert!((ask(0, &weights)[0].probability - 0.9 * 0.9).abs() < 1e-6);
         let all = tiny::view(&version, &[0, 1]);
-        let none = wants(&version, &all.resident, &[StateId(0)], &weights, &Horizon::default());
-        assert!(none.is_empty());
+        let found = ahead(&version, &all.resident, &[StateId(0)], &weights, &Horizon::default());
+        assert!(found.len() == 1 && found[0].resident);
     }
 
     #[test]
-    fn equal_inputs_give_equal_wants() {
+    fn equal_inputs_give_equal_answers() {
         let version = tiny::version(2, tiny::grown_links());
         let view = tiny::view(&version, &[]);
         let cursors = [StateId(5), StateId(0), StateId(1_000_000)];
         let ask = || {
             let weights = EdgeWeights::default();
-            wants(&version, &view.resident, &cursors, &weights, &Horizon::default())
+            ahead(&version, &view.resident, &cursors, &weights, &Horizon::default())
         };
         let first = ask();
         assert_eq!(first.len(), 2, "a cursor that does not exist is ignored");
         assert!((0..10).all(|_| ask() == first));
         assert_eq!(first[0].frames, 0, "where a cursor stands comes first");
+    }
+
+    #[test]
+    fn a_plan_takes_what_fits_and_never_nothing() {
+        let chunk = |id: u8, resident| {
+            let chunk = ChunkRef { hash: ChunkHash([id; 32]), bytes: 100 };
+            Ahead { chunk, frames: 0, probability: 1.0, resident }
+        };
+        let all = [chunk(1, true), chunk(2, false), chunk(3, false)];
+        let plan_250 = plan(&all, 250);
+        assert_eq!(plan_250.fetch, [chunk(2, false)]);
+        assert_eq!(plan_250.keep.len(), 2);
+        assert_eq!(plan(&all[1..], 10).fetch, [chunk(2, false)]);
     }
 }

@@ -2,14 +2,15 @@
 //!
 //! Edges: 0 -> 0 (edge 0), 0 -> 1 (edge 1), 1 -> 0 (edge 2).
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use codec::{Basis, kim2013};
 use protocol::links::{LinkEntry, LinkPage};
 use protocol::manifest::{ChunkRef, GarmentVersion, GenerationRef, RegionChunkRef, VersionStats};
+use protocol::region::{RegionChunk, RegionEntry};
 use protocol::scene::{Edge, GarmentChunk, Joint, Pose, SceneChunk};
-use protocol::{ChunkHash, GarmentId, PoseId, StateId, VersionNumber};
+use protocol::{ChunkHash, GarmentId, GenerationId, PoseId, StateId, VersionNumber};
 
 use crate::cache::{Cache, Region};
 use crate::scene::Scene;
@@ -53,6 +54,13 @@ pub fn scene_chunk() -> SceneChunk {
 
 /// One vertex; x is column 0, y is column 1.
 pub fn basis() -> Basis {
+    let mut basis = Basis::new();
+    basis.append(&kim2013::Generation::parse(&generation()).unwrap()).unwrap();
+    basis
+}
+
+/// The basis in bytes.
+fn generation() -> Vec<u8> {
     let mut entries = [0i16; 6];
     let (x, y) = entries.split_at_mut(3);
     kim2013::quantise_column(&[SCALE_M, 0.0, 0.0], kim2013::STEP_M, x).unwrap();
@@ -60,9 +68,7 @@ pub fn basis() -> Basis {
     let mut bytes = Vec::new();
     let maxima = [SCALE_M, SCALE_M];
     kim2013::encode_generation(3, kim2013::STEP_M, &maxima, &entries, &mut bytes).unwrap();
-    let mut basis = Basis::new();
-    basis.append(&kim2013::Generation::parse(&bytes).unwrap()).unwrap();
-    basis
+    bytes
 }
 
 /// An interior state.
@@ -135,7 +141,7 @@ pub fn version(number: u64, links: Vec<LinkEntry>) -> Arc<Version> {
         scene: Arc::new(Scene::new(scene_chunk()).unwrap()),
         mesh: Arc::new(GarmentChunk { name: "speck".into(), vertex_count: 1, triangles: vec![] }),
         basis: Arc::new(basis()),
-        pages: vec![Arc::new(LinkPage { first_state: StateId(0), entries: links })],
+        pages: vec![LinkPage { first_state: StateId(0), entries: links }],
     };
     Arc::new(Version::assemble(parts).unwrap())
 }
@@ -160,4 +166,48 @@ pub fn view(version: &Arc<Version>, parts: &[u64]) -> Arc<View> {
         cache.insert(region_chunk(*part), vec![region], *part == 0, &BTreeSet::new());
     }
     Arc::new(View { version: Arc::clone(version), resident: Arc::new(cache.snapshot()) })
+}
+
+/// A version as a publisher lays it down: its garment, and its chunks by name.
+pub fn published(links: Vec<LinkEntry>) -> (GarmentVersion, BTreeMap<ChunkHash, Vec<u8>>) {
+    let mut chunks = BTreeMap::new();
+    let mut put = |bytes: Vec<u8>| {
+        let chunk = ChunkRef { hash: ChunkHash::of(&bytes), bytes: bytes.len() as u32 };
+        chunks.insert(chunk.hash, bytes);
+        chunk
+    };
+    let mut regions = Vec::new();
+    for (first, end) in [(0, 4), (4, links.len() as u64)] {
+        if first < end {
+            let rows: Vec<i16> = (first..end).flat_map(coefficients).collect();
+            let mut bytes = Vec::new();
+            kim2013::encode_region(2, &rows, &mut bytes).unwrap();
+            let entry = RegionEntry {
+                first_state: StateId(first),
+                state_count: (end - first) as u16,
+                generation: GenerationId(0),
+                max_error_m: 0.0,
+                bytes,
+            };
+            regions.push(RegionChunkRef {
+                chunk: put(RegionChunk { regions: vec![entry] }.encode()),
+                first_state: StateId(first),
+                state_count: (end - first) as u32,
+                initial: first == 0,
+            });
+        }
+    }
+    let mesh = GarmentChunk { name: "speck".into(), vertex_count: 1, triangles: vec![] };
+    let garment = GarmentVersion {
+        id: GarmentId(0),
+        name: "speck".into(),
+        codec: kim2013::PROFILE.into(),
+        scene: put(scene_chunk().encode()),
+        mesh: put(mesh.encode()),
+        generations: vec![GenerationRef { chunk: put(generation()), columns: 2 }],
+        regions,
+        links: vec![put(LinkPage { first_state: StateId(0), entries: links }.encode())],
+        stats: VersionStats::default(),
+    };
+    (garment, chunks)
 }

@@ -39,7 +39,7 @@ pub struct Parts {
     /// From all chunks of `garment.generations`.
     pub basis: Arc<Basis>,
     /// From all chunks of `garment.links`, in order.
-    pub pages: Vec<Arc<LinkPage>>,
+    pub pages: Vec<LinkPage>,
 }
 
 /// Why parts do not make a version.
@@ -85,7 +85,6 @@ impl Version {
             let vertices = mesh.vertex_count;
             return Err(VersionError::MeshMismatch { number, rows, vertices });
         }
-        let pages: Vec<LinkPage> = pages.iter().map(|page| LinkPage::clone(page)).collect();
         let links = LinkTable::new(&pages, scene.pose_count(), scene.edges())
             .map_err(|source| VersionError::NotTotal { number, garment: garment.id, source })?;
         Ok(Self { number, garment, scene, mesh, basis, links })

@@ -1,0 +1,470 @@
+//! From manifests and chunks to views: what is still lacking, what was read, what can be played.
+//!
+//! One [`GarmentLoader`] per garment, fed by the driver off the frame loop. No I/O: chunks in,
+//! wants and views out.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use codec::{Basis, kim2013};
+use protocol::links::LinkPage;
+use protocol::manifest::{ChunkRef, GarmentVersion};
+use protocol::region::{RegionChunk, RegionEntry};
+use protocol::scene::{GarmentChunk, SceneChunk};
+use protocol::{ChunkHash, DecodeError, GarmentId, VersionNumber};
+
+use crate::cache::{Cache, Region};
+use crate::prefetch::{self, EdgeWeights, Horizon, Plan};
+use crate::scene::Scene;
+use crate::shared::Stage;
+use crate::telemetry::Batch;
+use crate::version::{Parts, Version, VersionError, View};
+
+/// Of the cache's budget, the share that is planned for; the rest is for what decoding adds.
+const PLANNED_SHARE: f32 = 0.8;
+/// What lies at most this many frames ahead is urgent.
+const URGENT_FRAMES: u32 = 30;
+
+/// Why a garment's chunk or version was refused. The version before is played on.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum LoadError {
+    /// The bytes do not parse.
+    #[error("garment {garment}: chunk {chunk}: {source}")]
+    Chunk {
+        /// The garment.
+        garment: GarmentId,
+        /// The chunk.
+        chunk: ChunkHash,
+        /// What is wrong.
+        source: DecodeError,
+    },
+    /// The encoded numbers do not parse.
+    #[error("garment {garment}: chunk {chunk}: {why}")]
+    Codec {
+        /// The garment.
+        garment: GarmentId,
+        /// The chunk.
+        chunk: ChunkHash,
+        /// What is wrong.
+        why: String,
+    },
+    /// Encoded in a way that this client cannot read.
+    #[error(
+        "garment \"{garment}\" is encoded as \"{found}\"; this client reads \"{}\": update it",
+        kim2013::PROFILE
+    )]
+    Profile {
+        /// The garment's name.
+        garment: String,
+        /// Its codec.
+        found: String,
+    },
+    /// The parts do not fit together.
+    #[error(transparent)]
+    Version(#[from] VersionError),
+}
+
+/// How soon a chunk is needed, the most urgent first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Need {
+    /// A version cannot be shown without it.
+    Version,
+    /// A cursor is there within a second.
+    Urgent,
+    /// Within the horizon.
+    Soon,
+    /// Nothing else to do.
+    Idle,
+}
+
+/// Memory of one garment, in bytes.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Memory {
+    /// Decoded regions, the initial graph included; no basis.
+    pub regions: usize,
+    /// Of these, the initial graph.
+    pub initial: usize,
+    /// Transition table and the pages it was made from.
+    pub links: usize,
+    /// Poses, edges, body.
+    pub scene: usize,
+    /// Basis columns.
+    pub basis: usize,
+}
+
+impl Memory {
+    /// Both together.
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            regions: self.regions + other.regions,
+            initial: self.initial + other.initial,
+            links: self.links + other.links,
+            scene: self.scene + other.scene,
+            basis: self.basis + other.basis,
+        }
+    }
+}
+
+/// One garment's way from chunks to views.
+#[derive(Debug)]
+pub struct GarmentLoader {
+    stage: Arc<Stage>,
+    budget_bytes: usize,
+    horizon: Horizon,
+    weights: EdgeWeights,
+    current: Option<Arc<Version>>,
+    /// The newest version announced, while it is not complete.
+    next: Option<(VersionNumber, GarmentVersion)>,
+    cache: Cache,
+    /// Where the next version's coefficients go if they are of another basis.
+    next_cache: Option<Cache>,
+    plan: Plan,
+    parts: PartsSoFar,
+    /// Chunks that are broken or missing on the server; tried again with the next version.
+    refused: BTreeSet<ChunkHash>,
+    changed: bool,
+}
+
+/// What was read of the next version and kept of the current one.
+#[derive(Debug, Default)]
+struct PartsSoFar {
+    scene: Option<(ChunkHash, Arc<Scene>)>,
+    mesh: Option<(ChunkHash, Arc<GarmentChunk>)>,
+    basis: Option<(Vec<ChunkHash>, Arc<Basis>)>,
+    /// Encoded generations that are not yet in `basis`.
+    generations: BTreeMap<ChunkHash, Vec<u8>>,
+    /// Encoded link pages, each read once on arrival.
+    pages: BTreeMap<ChunkHash, Vec<u8>>,
+}
+
+impl GarmentLoader {
+    /// A loader that shows its views on `stage`.
+    ///
+    /// `budget_bytes` bounds streamed regions, the initial graph apart.
+    pub fn new(stage: Arc<Stage>, budget_bytes: usize, horizon: Horizon) -> Self {
+        Self {
+            stage,
+            budget_bytes,
+            horizon,
+            weights: EdgeWeights::default(),
+            current: None,
+            next: None,
+            cache: Cache::new(budget_bytes),
+            next_cache: None,
+            plan: Plan::default(),
+            parts: PartsSoFar::default(),
+            refused: BTreeSet::new(),
+            changed: false,
+        }
+    }
+
+    /// Where its views are shown.
+    pub fn stage(&self) -> &Arc<Stage> {
+        &self.stage
+    }
+
+    /// The version that is shown.
+    pub fn current(&self) -> Option<&Arc<Version>> {
+        self.current.as_ref()
+    }
+
+    /// The newest version announced, while it is not complete.
+    pub fn pending(&self) -> Option<VersionNumber> {
+        self.next.as_ref().map(|(number, _)| *number)
+    }
+
+    /// A version was announced: from now on its chunks are wanted. One that was still being
+    /// loaded is passed over.
+    ///
+    /// # Errors
+    /// A codec that this client cannot read.
+    pub fn handle_version(
+        &mut self,
+        number: VersionNumber,
+        garment: &GarmentVersion,
+    ) -> Result<(), LoadError> {
+        if garment.codec != kim2013::PROFILE {
+            let (garment, found) = (garment.name.clone(), garment.codec.clone());
+            return Err(LoadError::Profile { garment, found });
+        }
+        self.refused.clear();
+        let oldest = |listing: &GarmentVersion| listing.generations.first().map(|g| g.chunk.hash);
+        let held = self.current.as_ref().map(|version| version.lineage());
+        let other_basis = held.is_some_and(|lineage| lineage != oldest(garment));
+        self.next_cache = other_basis.then(|| Cache::new(self.budget_bytes));
+        self.next = Some((number, garment.clone()));
+        self.changed = true;
+        Ok(())
+    }
+
+    /// A chunk arrived, its hash verified. Chunks of other garments are passed over.
+    ///
+    /// # Errors
+    /// It is broken; it is not wanted again before the next version.
+    pub fn handle_chunk(&mut self, chunk: ChunkHash, bytes: &[u8]) -> Result<(), LoadError> {
+        let read = self.read(chunk, bytes);
+        if read.is_err() {
+            self.refused.insert(chunk);
+        }
+        read
+    }
+
+    /// The server does not have this chunk.
+    pub fn handle_missing(&mut self, chunk: ChunkHash) {
+        self.refused.insert(chunk);
+    }
+
+    /// Counts what was walked, for prefetching.
+    pub fn handle_walked(&mut self, batch: &Batch) {
+        for (edge, count) in &batch.edges {
+            self.weights.add(*edge, *count);
+        }
+    }
+
+    /// Shows what has become playable; says whether a new version is among it.
+    ///
+    /// # Errors
+    /// The next version's parts do not fit together; the current one is played on.
+    pub fn show(&mut self) -> Result<bool, LoadError> {
+        if !std::mem::take(&mut self.changed) {
+            return Ok(false);
+        }
+        let completed = self.complete_next();
+        if let Some(version) = &self.current {
+            let resident = Arc::new(self.cache.snapshot());
+            self.stage.show(Arc::new(View { version: Arc::clone(version), resident }));
+        }
+        completed
+    }
+
+    /// Looks ahead of the cursors, and adds every chunk that is lacking to `wants`.
+    pub fn plan(&mut self, wants: &mut BTreeMap<ChunkHash, (ChunkRef, Need)>) {
+        let mut add = |chunk: ChunkRef, need: Need| {
+            if !self.refused.contains(&chunk.hash) {
+                let want = wants.entry(chunk.hash).or_insert((chunk, need));
+                want.1 = want.1.min(need);
+            }
+        };
+        if let Some((_, next)) = &self.next {
+            let cache = self.next_cache.as_ref().unwrap_or(&self.cache);
+            self.parts.lacking(next, |chunk| add(chunk, Need::Version));
+            let initial = next.regions.iter().filter(|region| region.initial);
+            let lacking = initial.filter(|region| !cache.contains(&region.chunk.hash));
+            lacking.for_each(|region| add(region.chunk, Need::Version));
+        }
+        let (Some(version), Some(view)) = (&self.current, self.stage.view()) else { return };
+        let cursors = self.stage.cursors();
+        let ahead =
+            prefetch::ahead(version, &view.resident, &cursors, &self.weights, &self.horizon);
+        let budget_bytes = (self.budget_bytes as f32 * PLANNED_SHARE) as usize;
+        self.plan = prefetch::plan(&ahead, budget_bytes);
+        for chunk in &self.plan.fetch {
+            let soon = if chunk.frames <= URGENT_FRAMES { Need::Urgent } else { Need::Soon };
+            add(chunk.chunk, soon);
+        }
+        // Whatever fits without pushing anything out.
+        let mut filled = self.cache.resident_bytes() - self.cache.initial_bytes();
+        filled += self.plan.fetch.iter().map(|ahead| ahead.chunk.bytes as usize).sum::<usize>();
+        for region in &version.listing().regions {
+            if !self.cache.contains(&region.chunk.hash) {
+                filled += region.chunk.bytes as usize;
+                if filled > budget_bytes {
+                    break;
+                }
+                add(region.chunk, Need::Idle);
+            }
+        }
+    }
+
+    /// Whether everything is here that the last plan found ahead of the cursors.
+    pub fn is_ahead(&self) -> bool {
+        self.plan.fetch.iter().all(|ahead| self.refused.contains(&ahead.chunk.hash))
+    }
+
+    /// What it holds in memory.
+    pub fn memory(&self) -> Memory {
+        let version = self.current.as_ref();
+        let pages: usize = self.parts.pages.values().map(Vec::len).sum();
+        Memory {
+            regions: self.cache.resident_bytes(),
+            initial: self.cache.initial_bytes(),
+            links: pages + version.map_or(0, |version| version.link_bytes()),
+            scene: version.map_or(0, |version| version.scene().resident_bytes()),
+            basis: version.map_or(0, |version| version.basis().resident_bytes()),
+        }
+    }
+
+    fn read(&mut self, chunk: ChunkHash, bytes: &[u8]) -> Result<(), LoadError> {
+        let garment = self.id();
+        if let Some((_, next)) = &self.next {
+            let broken = |source| LoadError::Chunk { garment, chunk, source };
+            if next.scene.hash == chunk {
+                let scene = SceneChunk::decode(bytes).and_then(Scene::new).map_err(broken)?;
+                self.parts.scene = Some((chunk, Arc::new(scene)));
+                self.changed = true;
+            }
+            if next.mesh.hash == chunk {
+                let mesh = GarmentChunk::decode(bytes).map_err(broken)?;
+                self.parts.mesh = Some((chunk, Arc::new(mesh)));
+                self.changed = true;
+            }
+            if next.generations.iter().any(|generation| generation.chunk.hash == chunk) {
+                let why = |e: kim2013::GenerationError| e.to_string();
+                let codec = |why| LoadError::Codec { garment, chunk, why };
+                kim2013::Generation::parse(bytes).map_err(|e| codec(why(e)))?;
+                self.parts.generations.insert(chunk, bytes.to_vec());
+                self.changed = true;
+            }
+            if next.links.iter().any(|page| page.hash == chunk) {
+                LinkPage::decode(bytes).map_err(broken)?;
+                self.parts.pages.insert(chunk, bytes.to_vec());
+                self.changed = true;
+            }
+        }
+        self.read_regions(chunk, bytes)
+    }
+
+    fn read_regions(&mut self, chunk: ChunkHash, bytes: &[u8]) -> Result<(), LoadError> {
+        let garment = self.id();
+        let listed = |listing: &GarmentVersion| {
+            listing.regions.iter().find(|r| r.chunk.hash == chunk).map(|r| r.initial)
+        };
+        let next = self.next.as_ref().and_then(|(_, next)| listed(next));
+        let current = self.current.as_ref().and_then(|version| listed(version.listing()));
+        let Some(initial) = next.or(current) else { return Ok(()) };
+        let regions = RegionChunk::decode(bytes).map_err(|source| LoadError::Chunk {
+            garment,
+            chunk,
+            source,
+        })?;
+        let decoded: Result<Vec<Region>, String> = regions.regions.iter().map(decode).collect();
+        let decoded = decoded.map_err(|why| LoadError::Codec { garment, chunk, why })?;
+        let cache = match &mut self.next_cache {
+            Some(cache) if next.is_some() => cache,
+            _ => &mut self.cache,
+        };
+        self.changed |= cache.insert(chunk, decoded, initial, &self.plan.keep);
+        Ok(())
+    }
+
+    /// Makes the next version the current one if nothing of it is lacking.
+    fn complete_next(&mut self) -> Result<bool, LoadError> {
+        let Some((number, next)) = &self.next else { return Ok(false) };
+        let cache = self.next_cache.as_ref().unwrap_or(&self.cache);
+        let mut lacking = 0;
+        self.parts.lacking(next, |_| lacking += 1);
+        let initial = || next.regions.iter().filter(|region| region.initial);
+        lacking += initial().filter(|region| !cache.contains(&region.chunk.hash)).count();
+        if lacking > 0 {
+            return Ok(false);
+        }
+        let (number, next) = (*number, next.clone());
+        let keep: BTreeSet<ChunkHash> = initial().map(|region| region.chunk.hash).collect();
+        // Whatever comes of it, it is not tried again.
+        self.next = None;
+        let parts = self.parts.parts(number, next)?;
+        self.current = Some(Arc::new(Version::assemble(parts)?));
+        if let Some(cache) = self.next_cache.take() {
+            self.cache = cache;
+        }
+        self.cache.retain_initial(&keep);
+        Ok(true)
+    }
+
+    fn id(&self) -> GarmentId {
+        let next = self.next.as_ref().map(|(_, next)| next.id);
+        next.or(self.current.as_ref().map(|v| v.garment())).unwrap_or(GarmentId(0))
+    }
+}
+
+impl PartsSoFar {
+    /// Calls `lacks` for every chunk that is not here, regions apart.
+    fn lacking(&self, next: &GarmentVersion, mut lacks: impl FnMut(ChunkRef)) {
+        let scene = self.scene.as_ref().map(|(hash, _)| *hash);
+        let mesh = self.mesh.as_ref().map(|(hash, _)| *hash);
+        if scene != Some(next.scene.hash) {
+            lacks(next.scene);
+        }
+        if mesh != Some(next.mesh.hash) {
+            lacks(next.mesh);
+        }
+        let known = self.known_generations(next);
+        let unread = next.generations[known..].iter().map(|generation| generation.chunk);
+        unread.filter(|g| !self.generations.contains_key(&g.hash)).for_each(&mut lacks);
+        next.links.iter().filter(|p| !self.pages.contains_key(&p.hash)).copied().for_each(lacks);
+    }
+
+    /// How many of the listed generations the basis at hand has; 0 if it has others.
+    fn known_generations(&self, next: &GarmentVersion) -> usize {
+        let Some((hashes, _)) = &self.basis else { return 0 };
+        let listed = next.generations.iter().map(|generation| generation.chunk.hash);
+        let same = listed.zip(hashes).filter(|(a, b)| a == *b).count();
+        if same == hashes.len() { same } else { 0 }
+    }
+
+    /// All parts of a version of which nothing is lacking; forgets what it does not need.
+    fn parts(&mut self, number: VersionNumber, next: GarmentVersion) -> Result<Parts, LoadError> {
+        let basis = self.basis(&next)?;
+        let garment = next.id;
+        let mut pages = Vec::with_capacity(next.links.len());
+        for page in &next.links {
+            let chunk = page.hash;
+            let bytes = self.pages.get(&chunk).map_or(&[][..], Vec::as_slice);
+            let page = LinkPage::decode(bytes);
+            pages.push(page.map_err(|source| LoadError::Chunk { garment, chunk, source })?);
+        }
+        let listed: BTreeSet<ChunkHash> = next.links.iter().map(|page| page.hash).collect();
+        self.pages.retain(|hash, _| listed.contains(hash));
+        let lost = |chunk, what: &str| LoadError::Codec { garment, chunk, why: what.to_owned() };
+        let scene = self.scene.as_ref().ok_or_else(|| lost(next.scene.hash, "no scene"))?;
+        let mesh = self.mesh.as_ref().ok_or_else(|| lost(next.mesh.hash, "no mesh"))?;
+        let (scene, mesh) = (Arc::clone(&scene.1), Arc::clone(&mesh.1));
+        Ok(Parts { number, garment: next, scene, mesh, basis, pages })
+    }
+
+    /// The basis with all listed generations; appends those that it lacks.
+    fn basis(&mut self, next: &GarmentVersion) -> Result<Arc<Basis>, LoadError> {
+        let known = self.known_generations(next);
+        let mut basis = match &self.basis {
+            Some((hashes, basis)) if known == next.generations.len() && known == hashes.len() => {
+                return Ok(Arc::clone(basis));
+            }
+            Some((_, basis)) if known > 0 => Basis::clone(basis),
+            _ => Basis::new(),
+        };
+        for generation in &next.generations[known..] {
+            let chunk = generation.chunk.hash;
+            let codec = |why| LoadError::Codec { garment: next.id, chunk, why };
+            let bytes = self.generations.get(&chunk).map_or(&[][..], Vec::as_slice);
+            let parsed = kim2013::Generation::parse(bytes).map_err(|e| codec(e.to_string()))?;
+            basis.append(&parsed).map_err(|e| codec(e.to_string()))?;
+        }
+        let hashes = next.generations.iter().map(|generation| generation.chunk.hash).collect();
+        let basis = Arc::new(basis);
+        self.basis = Some((hashes, Arc::clone(&basis)));
+        self.generations.clear();
+        Ok(basis)
+    }
+}
+
+/// Coefficients of a region as the publisher rounded them.
+fn decode(entry: &RegionEntry) -> Result<Region, String> {
+    let region = kim2013::Region::parse(&entry.bytes).map_err(|e| e.to_string())?;
+    if region.states() != usize::from(entry.state_count) {
+        let (found, listed) = (region.states(), entry.state_count);
+        return Err(format!("a region of {found} states where {listed} are listed"));
+    }
+    let columns = region.columns();
+    let mut fractions = vec![0.0; columns];
+    let mut coefficients = Vec::with_capacity(region.states() * columns);
+    for state in 0..region.states() {
+        region.state(state, &mut fractions);
+        let steps = fractions.iter().map(|c| (c * kim2013::FULL_SCALE).round() as i16);
+        coefficients.extend(steps);
+    }
+    Ok(Region::new(entry.first_state, columns, coefficients))
+}
+
+#[cfg(test)]
+mod tests;
