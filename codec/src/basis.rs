@@ -2,18 +2,19 @@
 //! column inside a panel, so that reconstruction reads one sequential stream.
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use crate::COLUMNS_MAX;
 use crate::kernel::{self, PANEL_ROWS};
 use crate::kim2013::{Generation, Width};
 
-/// Columns of all generations so far. Appending changes nothing of what is there.
+/// Columns of all generations so far. Appending changes nothing of what is there; a clone shares it.
 #[derive(Debug, Clone, Default)]
 pub struct Basis {
     rows: usize,
     columns: usize,
     maxima: Vec<f32>,
-    generations: Vec<Panels>,
+    generations: Vec<Arc<Panels>>,
 }
 
 /// One generation in panel layout.
@@ -131,7 +132,8 @@ impl Basis {
             i16::from_le_bytes([b[0], b[1]])
         });
         self.maxima.extend((0..generation.columns()).map(|c| generation.maximum(c)));
-        self.generations.push(Panels { step_m: generation.step_m(), narrow, wide });
+        let step_m = generation.step_m();
+        self.generations.push(Arc::new(Panels { step_m, narrow, wide }));
         (self.rows, self.columns) = (actual, columns);
         Ok(())
     }

@@ -1,19 +1,18 @@
 //! Publishing into in-memory and on-disk stores, with states that nobody simulated.
 
+mod ring;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use cloth::{Body, Pose, Quat, Rigid, Skeleton, Vec3};
 use codec::Basis;
 use codec::kim2013::{Generation, Region};
 use explorer::pack::{
     EncodeSettings, InspectError, PublishError, Publisher, RunsError, StoreError,
     collect_leftovers, inspect, local_store,
 };
-use explorer::primary::{PrimaryEdge, PrimaryGraph, PrimaryPose};
-use explorer::scene::{ExplorationSettings, Fabric, Garment, Scene};
 use explorer::view::{GraphView, Run};
-use futures::{StreamExt, TryStreamExt};
+use futures::TryStreamExt;
 use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
@@ -22,129 +21,8 @@ use protocol::manifest::VersionStats;
 use protocol::region::RegionChunk;
 use protocol::{Manifest, PoseId, SigningKey, StateId};
 
-const VERTICES: usize = 60;
-const ROWS: usize = 3 * VERTICES;
-const POSES: u32 = 40;
-
-/// A ring of poses, and trajectories round it: each ends in a dead end, merged into the first.
-struct Ring {
-    runs: Vec<Run>,
-    /// Job from which on states have a shape that earlier ones lack.
-    odd_from: u64,
-}
-
-impl Ring {
-    fn new(jobs: u64) -> Self {
-        let mut runs = vec![Run { first: StateId(0), count: POSES + 1, job: 0, initial: true }];
-        for job in 1..jobs {
-            let last = runs.last().unwrap();
-            let first = StateId(last.first.0 + u64::from(last.count));
-            runs.push(Run { first, count: 10 + 7 * job as u32, job, initial: false });
-        }
-        Self { runs, odd_from: u64::MAX }
-    }
-
-    fn states(&self) -> u64 {
-        self.runs.last().map_or(0, |last| last.first.0 + u64::from(last.count))
-    }
-
-    fn state(&self, state: StateId) -> Vec<f32> {
-        let run = self.runs.iter().rev().find(|run| run.first <= state).unwrap();
-        let t = (state.0 as f32) * 0.2;
-        let odd = if run.job >= self.odd_from { 0.1 } else { 0.0 };
-        let row = |row: usize| {
-            let x = row as f32 / ROWS as f32;
-            let shapes = (1..9).map(|k| k as f32).map(|k| {
-                0.3 / (k * k) * (k * t + 0.3 * run.job as f32).sin() * (7.0 * k * x + k).cos()
-            });
-            0.5 * (9.0 * x).sin() + shapes.sum::<f32>() + odd * (t + 90.0 * x * x).sin()
-        };
-        (0..ROWS).map(row).collect()
-    }
-}
-
-impl GraphView for Ring {
-    fn vertex_count(&self) -> usize {
-        VERTICES
-    }
-
-    fn runs(&self) -> &[Run] {
-        &self.runs
-    }
-
-    fn positions(&self, state: StateId, out: &mut [f32]) -> std::io::Result<()> {
-        out.copy_from_slice(&self.state(state));
-        Ok(())
-    }
-
-    fn links(&self) -> Vec<LinkEntry> {
-        let entry = |run: &Run, i: u32| {
-            let pose = PoseId(i % POSES);
-            if i + 1 == run.count {
-                return LinkEntry::DeadEnd { pose, target: StateId(pose.0.into()), error_m: 0.01 };
-            }
-            LinkEntry::Interior { pose, next: vec![StateId(run.first.0 + u64::from(i) + 1)] }
-        };
-        self.runs.iter().flat_map(|run| (0..run.count).map(move |i| entry(run, i))).collect()
-    }
-
-    fn stats(&self) -> VersionStats {
-        let merges = self.runs.len() as u64;
-        let (states, worst_error_m) = (self.states(), 0.01);
-        VersionStats { poses: POSES, edges: POSES, states, merges, worst_error_m, ..<_>::default() }
-    }
-}
-
-fn scene() -> Scene {
-    let skeleton = Skeleton {
-        names: vec!["hips".into()],
-        parents: vec![None],
-        offsets: vec![Vec3::ZERO],
-        rest: vec![Rigid::IDENTITY],
-    };
-    let at = |i: usize| Vec3::new((i as f32).sin(), (i as f32).cos(), i as f32 / 9.0);
-    let body = Body {
-        skeleton,
-        rest_positions: (0..9).map(at).collect(),
-        triangles: vec![[0, 1, 2]],
-        joints: vec![[0; 4]; 9],
-        weights: vec![[1.0, 0.0, 0.0, 0.0]; 9],
-    };
-    let pose = |frame| PrimaryPose {
-        clip: 0,
-        frame,
-        transition: false,
-        pose: Pose { root: Vec3::Y, rotations: vec![Quat::IDENTITY] },
-    };
-    let edge = |from: u32| PrimaryEdge {
-        from: PoseId(from),
-        to: PoseId((from + 1) % POSES),
-        yaw: 0.0,
-        shift: [0.0; 2],
-    };
-    let poses = (0..POSES).map(pose).collect();
-    let edges = (0..POSES).map(edge).collect();
-    let primary = PrimaryGraph::new(30.0, vec!["ring".into()], poses, edges).unwrap();
-    let garment = Garment {
-        name: "sheet".into(),
-        positions: (0..VERTICES).map(at).collect(),
-        triangles: (0..VERTICES as u32 - 2).map(|i| [i, i + 1, i + 2]).collect(),
-        attached: vec![],
-        fabric: Fabric::default(),
-    };
-    Scene {
-        name: "ring".into(),
-        body: Arc::new(body),
-        primary: Arc::new(primary),
-        start: PoseId(0),
-        garment,
-        exploration: ExplorationSettings::default(),
-    }
-}
-
-fn key() -> SigningKey {
-    SigningKey::from_seed(&[7; 32])
-}
+use ring::full::Full;
+use ring::{POSES, ROWS, Ring, VERTICES, key, scene};
 
 fn settings() -> EncodeSettings {
     EncodeSettings::for_rank(12)
@@ -508,100 +386,4 @@ async fn a_full_disk_leaves_the_head_as_it_was() {
     let two = publisher.publish(&Ring::new(4)).await.unwrap();
     assert_eq!((two.number.0, two.created), (2, true));
     inspect(&*store, None).await.unwrap();
-}
-
-/// A store that refuses writes after a number of them.
-#[derive(Debug)]
-struct Full {
-    inner: InMemory,
-    left: std::sync::atomic::AtomicU64,
-}
-
-impl std::fmt::Display for Full {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("a full disk")
-    }
-}
-
-type Stored<'a, T> = futures::future::BoxFuture<'a, object_store::Result<T>>;
-type Listed<'a, T> = futures::stream::BoxStream<'a, object_store::Result<T>>;
-
-impl ObjectStore for Full {
-    fn put_opts<'a, 'b, 'c>(
-        &'a self,
-        location: &'b Path,
-        payload: object_store::PutPayload,
-        options: object_store::PutOptions,
-    ) -> Stored<'c, object_store::PutResult>
-    where
-        'a: 'c,
-        'b: 'c,
-    {
-        use std::sync::atomic::Ordering::SeqCst;
-        let spent = self.left.fetch_update(SeqCst, SeqCst, |left| left.checked_sub(1));
-        if spent.is_err() {
-            let source = std::io::Error::from(std::io::ErrorKind::StorageFull);
-            let source = std::io::Error::other(format!("No space left on device ({source})"));
-            let error = object_store::Error::Generic { store: "full", source: source.into() };
-            return Box::pin(std::future::ready(Err(error)));
-        }
-        self.inner.put_opts(location, payload, options)
-    }
-
-    fn put_multipart_opts<'a, 'b, 'c>(
-        &'a self,
-        location: &'b Path,
-        options: object_store::PutMultipartOptions,
-    ) -> Stored<'c, Box<dyn object_store::MultipartUpload>>
-    where
-        'a: 'c,
-        'b: 'c,
-    {
-        self.inner.put_multipart_opts(location, options)
-    }
-
-    fn get_opts<'a, 'b, 'c>(
-        &'a self,
-        location: &'b Path,
-        options: object_store::GetOptions,
-    ) -> Stored<'c, object_store::GetResult>
-    where
-        'a: 'c,
-        'b: 'c,
-    {
-        self.inner.get_opts(location, options)
-    }
-
-    fn delete_stream(&self, locations: Listed<'static, Path>) -> Listed<'static, Path> {
-        self.inner.delete_stream(locations)
-    }
-
-    fn list(&self, prefix: Option<&Path>) -> Listed<'static, object_store::ObjectMeta> {
-        self.inner.list(prefix).boxed()
-    }
-
-    fn list_with_delimiter<'a, 'b, 'c>(
-        &'a self,
-        prefix: Option<&'b Path>,
-    ) -> Stored<'c, object_store::ListResult>
-    where
-        'a: 'c,
-        'b: 'c,
-    {
-        self.inner.list_with_delimiter(prefix)
-    }
-
-    fn copy_opts<'a, 'b, 'd, 'c>(
-        &'a self,
-        from: &'b Path,
-        to: &'d Path,
-        options: object_store::CopyOptions,
-    ) -> Stored<'c, ()>
-    where
-        'a: 'c,
-        'b: 'c,
-        'd: 'c,
-    {
-        self.inner.copy_opts(from, to, options)
-    }
 }

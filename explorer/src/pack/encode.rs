@@ -2,6 +2,8 @@
 //!
 //! Every region is decoded again as a client decodes it, and every vertex of every state compared.
 
+use std::sync::Arc;
+
 use codec::kim2013::{self, FULL_SCALE, Generation, GenerationError, QuantiseError, Region};
 use codec::{AppendError, Basis};
 use faer::linalg::solvers::{Llt, Solve};
@@ -100,15 +102,14 @@ pub struct EncodedRegion {
 }
 
 /// Columns of all generations, as the encoder needs them. Made from encoded generations only, so
-/// that a publisher that was resumed encodes as one that never stopped.
+/// that a publisher that was resumed encodes as one that never stopped. Clones share them.
 #[derive(Clone)]
 pub struct Encoder {
     basis: Basis,
-    layers: Vec<Layer>,
+    layers: Vec<Arc<Layer>>,
 }
 
 /// One generation: `C' -> metres`, and the factor of its normal equations.
-#[derive(Clone)]
 struct Layer {
     columns: Mat<f64>,
     normal: Llt<f64>,
@@ -154,7 +155,7 @@ impl Encoder {
         }
         let normal =
             gram.llt(Side::Lower).map_err(|_| EncodeError::Dependent(self.layers.len()))?;
-        self.layers.push(Layer { columns, normal });
+        self.layers.push(Arc::new(Layer { columns, normal }));
         Ok(())
     }
 
