@@ -12,8 +12,9 @@ use protocol::{EdgeId, PoseId};
 
 use crate::primary::PrimaryGraph;
 
-/// Longest chain of one job: enough work for little overhead, little enough to lose on a kill.
-pub const CHAIN_FRAMES: usize = 64;
+/// Longest chain of one job: one region's worth, so that workers share the pass evenly and a kill
+/// costs little.
+pub const CHAIN_FRAMES: usize = protocol::limits::REGION_STATES_MAX;
 
 /// One initial job: edges in the order in which they are simulated.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -188,8 +189,8 @@ mod tests {
         let ring: Vec<(u32, u32)> = (0..poses).map(|p| (p, (p + 1) % poses)).collect();
         let plan = Plan::new(&toy::primary(poses, &ring), PoseId(0));
         let lengths: Vec<usize> = plan.jobs().iter().map(|job| job.edges.len()).collect();
-        assert_eq!(lengths, [64, 64, 22]);
-        assert_eq!(plan.jobs()[1].start, PoseId(64));
+        assert_eq!(lengths, [32, 32, 32, 32, 22]);
+        assert_eq!(plan.jobs()[1].start, PoseId(32));
         assert_eq!(plan.jobs()[0].height, 150);
     }
 
