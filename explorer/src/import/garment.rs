@@ -8,6 +8,7 @@ use protocol::limits::{TRIANGLES_MAX, VERTICES_MAX};
 
 use super::character::{self, CharacterError};
 use super::gltf_file::Document;
+use super::obj;
 use super::refine::{TooFine, refine};
 
 /// A triangle mesh as read.
@@ -43,8 +44,13 @@ pub enum Attachment {
 #[non_exhaustive]
 pub enum GarmentError {
     /// The OBJ file.
-    #[error("not a readable OBJ file: {0}; export the mesh again, triangles or polygons only")]
-    Obj(String),
+    #[error("line {line}: {problem}; export the mesh again as OBJ")]
+    Obj {
+        /// Counted from 1.
+        line: usize,
+        /// What is wrong.
+        problem: String,
+    },
     /// The glTF file.
     #[error(transparent)]
     Gltf(#[from] CharacterError),
@@ -88,26 +94,13 @@ impl Surface {
     pub fn read(path: &Path, bytes: &[u8]) -> Result<Self, GarmentError> {
         let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
         let surface = match ending.as_deref() {
-            Some("obj") => Self::parse_obj(bytes)?,
+            Some("obj") => obj::parse(bytes)?,
             Some("glb" | "gltf") => Self::parse_gltf(bytes, path.parent())?,
             _ => return Err(GarmentError::Kind),
         };
         let (vertices, triangles) = (surface.positions.len(), surface.triangles.len());
         if triangles == 0 || triangles > TRIANGLES_MAX || vertices > VERTICES_MAX {
             return Err(GarmentError::Size { vertices, triangles });
-        }
-        Ok(surface)
-    }
-
-    fn parse_obj(bytes: &[u8]) -> Result<Self, GarmentError> {
-        let options = tobj::LoadOptions { triangulate: true, ..Default::default() };
-        let no_materials = |_: &Path| tobj::MTLLoadResult::Ok(Default::default());
-        let (models, _) = tobj::load_obj_buf(&mut &bytes[..], &options, no_materials)
-            .map_err(|e| GarmentError::Obj(e.to_string()))?;
-        let mut surface = Self { positions: Vec::new(), triangles: Vec::new() };
-        for model in models {
-            let positions = model.mesh.positions.chunks_exact(3).map(Vec3::from_slice);
-            surface.append(positions.collect(), &model.mesh.indices)?;
         }
         Ok(surface)
     }

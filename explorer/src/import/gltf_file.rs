@@ -56,9 +56,12 @@ impl Document {
             return Err(GltfError::Unreadable(format!("over {FILE_BYTES_MAX} bytes")));
         }
         check_container(bytes)?;
-        let file = gltf::Gltf::from_slice(bytes)
+        // Its validation panics on primitives that name no accessor; everything that is read here
+        // is checked where it is read.
+        let file = gltf::Gltf::from_slice_without_validation(bytes)
             .map_err(|e| GltfError::Unreadable(e.to_string().replace('\n', " ")))?;
         let root = file.document.into_json();
+        check_version(&root)?;
         let mut blob = file.blob;
         let mut buffers = Vec::new();
         for (index, buffer) in root.buffers.iter().enumerate() {
@@ -222,6 +225,24 @@ fn check_container(bytes: &[u8]) -> Result<(), GltfError> {
             bytes.len()
         ))),
         None => Err(GltfError::Unreadable("it ends within its header".to_owned())),
+    }
+}
+
+/// Extensions that a file may require: they do not change where anything is.
+const HARMLESS: [&str; 4] =
+    ["KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization"];
+
+fn check_version(root: &json::Root) -> Result<(), GltfError> {
+    if !root.asset.version.starts_with("2.") {
+        let text = format!("its version is {:?}", root.asset.version);
+        return Err(GltfError::Unreadable(text));
+    }
+    let harmless = |name: &String| HARMLESS.iter().any(|known| name.starts_with(known));
+    match root.extensions_required.iter().find(|name| !harmless(name)) {
+        None => Ok(()),
+        Some(name) => Err(GltfError::Unreadable(format!(
+            "it requires the extension {name}, which is not supported; export without compression"
+        ))),
     }
 }
 

@@ -13,14 +13,19 @@ pub mod compute;
 pub mod garment;
 pub mod gltf_file;
 pub mod motion_graph;
+pub mod obj;
 pub mod reach;
 #[cfg(test)]
 mod real_data;
 pub mod refine;
+#[cfg(test)]
+mod refusals;
 pub mod retarget;
 pub mod scene_file;
 #[cfg(test)]
 mod synthetic;
+#[cfg(test)]
+mod synthetic_glb;
 pub mod transition;
 
 use std::path::{Path, PathBuf};
