@@ -61,7 +61,7 @@ impl Blend {
         }
     }
 
-    /// Counts an error [m] that begins in this frame and decays as its offset does.
+    /// Counts an error, in metres that begins in this frame and decays as its offset does.
     pub fn add_error(&mut self, error_m: f32) {
         self.errors_m[self.newest] += error_m;
     }
@@ -85,7 +85,7 @@ impl Blend {
         }
     }
 
-    /// What is left of the errors that the offsets hide [m].
+    /// What is left of the errors that the offsets hide, in metres.
     pub fn error_m(&self) -> f32 {
         let slot = |age| (self.newest + age) % BLEND_FRAMES;
         (0..BLEND_FRAMES).map(|age| weight(age) * self.errors_m[slot(age)]).sum()

@@ -32,7 +32,7 @@ pub enum StepOutcome {
     Exact,
     /// Another state of the same pose is shown.
     Substituted {
-        /// How far it is from what should be seen [m]: the largest distance of any vertex, when
+        /// How far it is from what should be seen, in metres: the largest distance of any vertex, when
         /// the two could last be compared.
         error_m: f32,
     },
@@ -198,7 +198,7 @@ impl Character {
     }
 
     /// What is left in this frame of the errors of merges and switches, and the error of a
-    /// substitute [m].
+    /// substitute, in metres.
     pub fn shown_error_m(&self) -> f32 {
         let substitute = match self.shown_by {
             Shown::Substitute { error_m, .. } => error_m,
@@ -322,7 +322,7 @@ impl Character {
     }
 
     /// Shows the resident state of `pose` nearest to what is shown, the offset decaying; gives
-    /// that state and its distance [m].
+    /// that state and its distance in metres.
     fn enter_nearest(
         &mut self,
         view: &View,
@@ -497,7 +497,7 @@ impl Drop for Character {
 /// * `rows`: which rows (x0, y0, z0, x1, ...; three per vertex).
 /// * `columns`: how many leading columns; fewer make a coarser state. More than there are means
 ///   all of them.
-/// * `out`: `rows.len()` numbers [m] per character, one after another.
+/// * `out`: `rows.len()` numbers (metres) per character, one after another.
 ///
 /// A host calls this on its own threads. Characters that share a basis read it once for all.
 ///
@@ -562,7 +562,7 @@ impl Scratch {
         best.map(|(_, state)| state)
     }
 
-    /// The largest distance of any vertex between `best` and `base` [m].
+    /// The largest distance of any vertex between `best` and `base`, in metres.
     ///
     /// Cost: one reconstruction, since positions are linear in coefficients.
     fn best_to_m(&mut self, base: &[f32], basis: &Basis) -> f32 {

@@ -26,7 +26,7 @@ pub mod character;
 pub mod client;
 pub mod clock;
 #[cfg(feature = "driver")]
-mod driver;
+pub mod driver;
 pub mod loader;
 pub mod placement;
 pub mod prefetch;

@@ -15,7 +15,7 @@ pub struct PlayStats {
     pub jumps: u64,
     /// Version switches that this character lived through.
     pub switches: u64,
-    /// Shown error per frame that was not missed [m]: what is left of the errors of merges and
+    /// Shown error per frame that was not missed, in metres: what is left of the errors of merges and
     /// switches under the blend, and the error of a substitute.
     pub shown_error_m: Histogram,
 }

@@ -75,9 +75,7 @@ pub struct Dialer {
 impl Dialer {
     /// `pin`: the certificate to insist on.
     pub fn new(address: String, pin: Option<Fingerprint>, inputs: mpsc::Sender<Input>) -> Self {
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let pin = Arc::new(Pin::new(pin, Arc::clone(&provider)));
-        let config = client_config(Arc::clone(&pin), provider);
+        let (pin, config) = client_config(pin);
         Self { address, pin, config, inputs, endpoints: [None, None] }
     }
 
@@ -126,7 +124,23 @@ impl Dialer {
     }
 }
 
-fn client_config(
+/// How a client speaks QUIC with a server whose certificate is pinned. For tools that open
+/// connections of their own; `None` trusts the first certificate.
+///
+/// # Errors
+/// A sentence: TLS 1.3 is not to be had.
+pub fn quic_config(pin: Option<Fingerprint>) -> Result<quinn::ClientConfig, String> {
+    client_config(pin).1
+}
+
+fn client_config(pin: Option<Fingerprint>) -> (Arc<Pin>, Result<quinn::ClientConfig, String>) {
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let pin = Arc::new(Pin::new(pin, Arc::clone(&provider)));
+    let config = pinned_config(Arc::clone(&pin), provider);
+    (pin, config)
+}
+
+fn pinned_config(
     pin: Arc<Pin>,
     provider: Arc<rustls::crypto::CryptoProvider>,
 ) -> Result<quinn::ClientConfig, String> {

@@ -19,6 +19,7 @@ use crate::client::{ClientConfig, Shared};
 use crate::loader::{GarmentLoader, LoadError, Memory, Need};
 use crate::shared::Stage;
 
+pub use link::quic_config;
 use link::{Dialer, Happened, Input, Link};
 pub use tls::Fingerprint;
 
@@ -396,3 +397,6 @@ fn priority(need: Need) -> Priority {
         Need::Idle => Priority::Background,
     }
 }
+
+#[cfg(test)]
+mod tests;
