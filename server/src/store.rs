@@ -1,0 +1,228 @@
+//! Reading the store: head, manifests, chunks. Nothing is served that is not what its name says.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytes::Bytes;
+use futures::TryStreamExt;
+use object_store::path::Path;
+use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions};
+use protocol::manifest::ManifestError;
+use protocol::{ChunkHash, PublisherKey, SignedManifest, VersionNumber, limits, store};
+
+/// Why something was not read from the store.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReadError {
+    /// It is not there.
+    #[error("{0} is not in the store")]
+    Missing(String),
+    /// A chunk's bytes are not those that its name promises. It is not served; publish it again.
+    #[error("{path} is corrupted: its bytes have the hash {found}; restore it from a copy")]
+    Corrupted {
+        /// The object.
+        path: String,
+        /// Hash of its bytes.
+        found: ChunkHash,
+    },
+    /// A manifest that is damaged, misplaced or not the publisher's.
+    #[error("version {number} is not served: {why}")]
+    BadManifest {
+        /// Its number.
+        number: VersionNumber,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// The publisher's key in the store is not one.
+    #[error("{} is not 64 hexadecimal digits", store::PUBLISHER)]
+    BadPublisher,
+    /// More bytes than anything stored may have.
+    #[error("{path} has {bytes} bytes; at most {} are allowed", limits::CHUNK_BYTES_MAX)]
+    TooLong {
+        /// The object.
+        path: String,
+        /// Its size.
+        bytes: u64,
+    },
+    /// The store itself failed.
+    #[error("the store failed at {path}: {source}")]
+    Store {
+        /// The object.
+        path: String,
+        /// Why.
+        source: object_store::Error,
+    },
+}
+
+/// A store with a bounded cache of chunks.
+#[derive(Debug)]
+pub(crate) struct Source {
+    store: Arc<dyn ObjectStore>,
+    cache: Mutex<Cache>,
+}
+
+impl Source {
+    pub fn new(store: Arc<dyn ObjectStore>, cache_bytes_max: usize) -> Self {
+        Self { store, cache: Mutex::new(Cache::new(cache_bytes_max)) }
+    }
+
+    /// All versions above `after`, newest first, by listing.
+    pub async fn versions(
+        &self,
+        after: Option<VersionNumber>,
+    ) -> Result<Vec<VersionNumber>, ReadError> {
+        let paths = self.paths(store::VERSIONS, after.map(store::version_path)).await?;
+        let numbers = paths.iter().filter_map(|path| store::version_of_path(path));
+        let mut numbers: Vec<_> = numbers.filter(|number| Some(*number) > after).collect();
+        numbers.sort_unstable();
+        numbers.reverse();
+        Ok(numbers)
+    }
+
+    /// The newest batch of telemetry, 0 for none.
+    pub async fn newest_telemetry(&self) -> Result<u64, ReadError> {
+        let paths = self.paths(store::TELEMETRY, None).await?;
+        Ok(paths.iter().filter_map(|path| store::telemetry_of_path(path)).max().unwrap_or(0))
+    }
+
+    /// Creates a batch of telemetry; `false` if that number is taken.
+    pub async fn create_telemetry(&self, number: u64, bytes: Vec<u8>) -> Result<bool, ReadError> {
+        let path = store::telemetry_path(number);
+        let options = PutOptions::from(PutMode::Create);
+        match self.store.put_opts(&Path::from(&*path), bytes.into(), options).await {
+            Ok(_) => Ok(true),
+            Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
+            Err(source) => Err(ReadError::Store { path, source }),
+        }
+    }
+
+    /// The publisher's key, once there is one.
+    pub async fn publisher(&self) -> Result<Option<PublisherKey>, ReadError> {
+        let Some(bytes) = self.read(store::PUBLISHER).await? else { return Ok(None) };
+        let text = std::str::from_utf8(&bytes).map_err(|_| ReadError::BadPublisher)?;
+        PublisherKey::from_hex(text).map(Some).ok_or(ReadError::BadPublisher)
+    }
+
+    /// A version, verified; `None` where there is none.
+    pub async fn version(
+        &self,
+        number: VersionNumber,
+        publisher: &PublisherKey,
+    ) -> Result<Option<Arc<SignedManifest>>, ReadError> {
+        let Some(bytes) = self.read(&store::version_path(number)).await? else { return Ok(None) };
+        let bad = |error: ManifestError| ReadError::BadManifest { number, why: error.to_string() };
+        let signed = SignedManifest::open(&bytes, publisher).map_err(bad)?;
+        let found = signed.manifest.number;
+        if found != number {
+            let why = format!("it holds the manifest of version {found}");
+            return Err(ReadError::BadManifest { number, why });
+        }
+        Ok(Some(Arc::new(signed)))
+    }
+
+    /// A chunk, verified against its name.
+    pub async fn chunk(&self, hash: &ChunkHash) -> Result<Bytes, ReadError> {
+        if let Some(bytes) = self.lock().get(hash) {
+            return Ok(bytes);
+        }
+        let path = store::chunk_path(hash);
+        let bytes = self.read(&path).await?.ok_or_else(|| ReadError::Missing(path.clone()))?;
+        let found = ChunkHash::of(&bytes);
+        if found != *hash {
+            return Err(ReadError::Corrupted { path, found });
+        }
+        self.lock().put(*hash, bytes.clone());
+        Ok(bytes)
+    }
+
+    /// Paths in a folder after `after`; the store may ignore `after`.
+    async fn paths(&self, folder: &str, after: Option<String>) -> Result<Vec<String>, ReadError> {
+        let prefix = Path::from(folder);
+        let listed = match after {
+            Some(after) => self.store.list_with_offset(Some(&prefix), &Path::from(after)),
+            None => self.store.list(Some(&prefix)),
+        };
+        let paths = listed.map_ok(|meta| meta.location.to_string()).try_collect();
+        paths.await.map_err(|source| ReadError::Store { path: folder.into(), source })
+    }
+
+    async fn read(&self, path: &str) -> Result<Option<Bytes>, ReadError> {
+        let failed = |source| ReadError::Store { path: path.into(), source };
+        match self.store.get(&Path::from(path)).await {
+            Ok(found) if found.meta.size > limits::CHUNK_BYTES_MAX as u64 => {
+                Err(ReadError::TooLong { path: path.into(), bytes: found.meta.size })
+            }
+            Ok(found) => found.bytes().await.map(Some).map_err(failed),
+            Err(object_store::Error::NotFound { .. }) => Ok(None),
+            Err(source) => Err(failed(source)),
+        }
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Cache> {
+        self.cache.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The chunks used last, up to a number of bytes.
+#[derive(Debug)]
+struct Cache {
+    chunks: HashMap<ChunkHash, (Bytes, u64)>,
+    /// By time of last use.
+    used: BTreeMap<u64, ChunkHash>,
+    uses: u64,
+    bytes: usize,
+    bytes_max: usize,
+}
+
+impl Cache {
+    fn new(bytes_max: usize) -> Self {
+        Self { chunks: HashMap::new(), used: BTreeMap::new(), uses: 0, bytes: 0, bytes_max }
+    }
+
+    fn get(&mut self, hash: &ChunkHash) -> Option<Bytes> {
+        let (bytes, used) = self.chunks.get_mut(hash)?;
+        self.used.remove(used);
+        self.uses += 1;
+        *used = self.uses;
+        self.used.insert(self.uses, *hash);
+        Some(bytes.clone())
+    }
+
+    fn put(&mut self, hash: ChunkHash, bytes: Bytes) {
+        if bytes.len() > self.bytes_max || self.chunks.contains_key(&hash) {
+            return;
+        }
+        self.bytes += bytes.len();
+        self.uses += 1;
+        self.used.insert(self.uses, hash);
+        self.chunks.insert(hash, (bytes, self.uses));
+        while self.bytes > self.bytes_max {
+            let (_, oldest) = self.used.pop_first().expect("what has bytes was used");
+            let (bytes, _) = self.chunks.remove(&oldest).expect("what was used is here");
+            self.bytes -= bytes.len();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_cache_keeps_what_was_used_last() {
+        let chunk = |byte: u8| (ChunkHash::of(&[byte]), Bytes::from(vec![byte; 10]));
+        let mut cache = Cache::new(30);
+        for byte in 0..3 {
+            let (hash, bytes) = chunk(byte);
+            cache.put(hash, bytes);
+        }
+        assert!(cache.get(&chunk(0).0).is_some());
+        let (hash, bytes) = chunk(3);
+        cache.put(hash, bytes);
+        let kept: Vec<_> = (0..4).map(|byte| cache.get(&chunk(byte).0).is_some()).collect();
+        assert_eq!(kept, [true, false, true, true]);
+        assert_eq!(cache.bytes, 30);
+        cache.put(ChunkHash::of(b"large"), Bytes::from(vec![0; 31]));
+        assert_eq!((cache.bytes, cache.chunks.len(), cache.used.len()), (30, 3, 3));
+    }
+}
