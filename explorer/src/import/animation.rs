@@ -4,13 +4,15 @@ use cloth::{Pose, Quat, Rigid, Skeleton, Vec3};
 use gltf::json;
 use gltf::json::animation::{Interpolation, Property};
 use gltf::json::validation::Checked;
-use protocol::limits::POSES_MAX;
+use protocol::limits::{NAME_BYTES_MAX, POSES_MAX};
 
 use super::character::{CharacterError, Clip, Rig};
 use super::gltf_file::Document;
 
 /// A joint other than the root may move in its parent by this much [m] before it is refused.
 const SLIDE_M: f32 = 1e-3;
+/// Rotations of all joints in all frames of all clips: 512 MB.
+const ROTATIONS_MAX: usize = 1 << 25;
 
 /// All animations that move a joint of the rig, sampled at `fps` from their first key on.
 pub(super) fn read_clips(
@@ -22,6 +24,7 @@ pub(super) fn read_clips(
     let mut clips: Vec<Clip> = Vec::new();
     for (index, animation) in document.root.animations.iter().enumerate() {
         let name = animation.name.clone().unwrap_or_else(|| format!("animation {index}"));
+        let name: String = name.chars().take(NAME_BYTES_MAX / 4).collect();
         let problem = |problem: String| CharacterError::Clip { clip: name.clone(), problem };
         let channels = read_channels(document, rig, animation, &name)?;
         if channels.is_empty() {
@@ -33,9 +36,11 @@ pub(super) fn read_clips(
         let start = channels.iter().map(|c| c.curve.times[0]).fold(f32::INFINITY, f32::min);
         let last = |c: &Channel| c.curve.times[c.curve.times.len() - 1];
         let end = channels.iter().map(last).fold(f32::NEG_INFINITY, f32::max);
-        let frames = ((end - start) * fps).round() as usize + 1;
-        if frames > POSES_MAX {
-            return Err(problem(format!("{frames} frames, at most {POSES_MAX} are allowed")));
+        let frames = (((end - start) * fps).round() as usize).saturating_add(1);
+        let before: usize = clips.iter().map(|c| c.poses.len()).sum();
+        let most = POSES_MAX.min(ROTATIONS_MAX / rig.nodes.len()).saturating_sub(before);
+        if frames > most {
+            return Err(problem(format!("{frames} frames, at most {most} are left for it")));
         }
         let poses = (0..frames)
             .map(|frame| sample(&channels, rig, start + frame as f32 / fps))

@@ -2,6 +2,8 @@
 
 use cloth::{Quat, Vec3};
 use protocol::limits::{JOINTS_MAX, NAME_BYTES_MAX, POSES_MAX};
+/// Rotations of all joints in all frames: 512 MB.
+const ROTATIONS_MAX: usize = 1 << 25;
 
 /// A skeleton with its motion, in the file's own unit.
 #[derive(Debug, Clone, PartialEq)]
@@ -83,8 +85,9 @@ impl Bvh {
         tokens.expect("Frame")?;
         tokens.expect("Time:")?;
         let frame_time_s = tokens.number("a frame time")?;
-        if count == 0 || count > POSES_MAX {
-            return Err(tokens.error(format!("{count} frames; 1 to {POSES_MAX} are allowed")));
+        let most = POSES_MAX.min(ROTATIONS_MAX / joints.len());
+        if count == 0 || count > most {
+            return Err(tokens.error(format!("{count} frames; 1 to {most} are allowed")));
         }
         if !(frame_time_s > 1e-4 && frame_time_s < 10.0) {
             return Err(tokens.error(format!("a frame time of {frame_time_s} s")));

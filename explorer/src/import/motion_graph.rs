@@ -316,6 +316,7 @@ pub fn build(
     let frames: Vec<usize> = clips.iter().map(|c| c.poses.len()).collect();
     let clip_frames: usize = frames.iter().sum();
     let most = clip_frames + transitions.len() * transition::TRANSITION_FRAMES;
+    too_many("clips", clips.len(), usize::from(u16::MAX))?;
     too_many("poses", most, POSES_MAX)?;
     too_many("edges", most + transitions.len(), EDGES_MAX)?;
     let topology = Topology::new(&frames, transitions, true);

@@ -72,6 +72,13 @@ fn the_dress_loads_and_every_edge_is_continuous_in_the_world() {
     let loaded = load("dress", Some(&data)).unwrap();
     let Scene { body, primary, garment, .. } = loaded.scene;
     assert!((5000..=5600).contains(&garment.positions.len()));
+    // The neckline is held, all around the neck.
+    let neck = body.skeleton.rest[body.skeleton.joint("Neck").unwrap()].translation;
+    let held: Vec<_> = garment.attached.iter().map(|v| garment.positions[*v as usize]).collect();
+    assert!((20..40).contains(&held.len()));
+    assert!(held.iter().all(|p| p.distance(neck) < 0.2), "{neck} {held:?}");
+    let middle = held.iter().sum::<cloth::Vec3>() / held.len() as f32;
+    assert!(middle.x.abs() < 0.01, "{middle}");
     // Speeds of all joints over each edge, in the world of its source.
     let mut worst = [0.0f32; 2];
     let (mut a, mut b) = (Vec::new(), Vec::new());

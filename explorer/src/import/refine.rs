@@ -28,6 +28,9 @@ pub fn refine(
     edge_length_m: f32,
     vertices_max: usize,
 ) -> Result<(), TooFine> {
+    if vertices_needed(positions, triangles, edge_length_m) > vertices_max as f64 {
+        return Err(TooFine { vertices_max });
+    }
     let mut mesh = Mesh::new(positions, triangles, edge_length_m);
     while let Some(edge) = mesh.longest() {
         if mesh.positions.len() >= vertices_max {
@@ -36,6 +39,20 @@ pub fn refine(
         mesh.cut(edge);
     }
     Ok(())
+}
+
+/// A lower bound: no triangle with such edges is larger than the equilateral one, and a manifold
+/// surface has at least half as many vertices as triangles.
+fn vertices_needed(positions: &[Vec3], triangles: &[[u32; 3]], edge_length_m: f32) -> f64 {
+    let area_m2: f64 = triangles
+        .iter()
+        .map(|t| {
+            let [a, b, c] = t.map(|v| positions[v as usize]);
+            f64::from((b - a).cross(c - a).length() * 0.5)
+        })
+        .sum();
+    let largest_m2 = 3f64.sqrt() / 4.0 * f64::from(edge_length_m) * f64::from(edge_length_m);
+    0.5 * area_m2 / largest_m2
 }
 
 type Edge = (u32, u32);
@@ -152,7 +169,10 @@ mod tests {
     fn too_fine_is_an_error() {
         let mut positions = vec![Vec3::ZERO, Vec3::X, Vec3::Y];
         let mut triangles = vec![[0, 1, 2]];
-        let result = refine(&mut positions, &mut triangles, 0.001, 100);
-        assert_eq!(result.unwrap_err(), TooFine { vertices_max: 100 });
+        // Foreseen by area, and found on the way.
+        for edge_length_m in [0.001, 0.09] {
+            let result = refine(&mut positions, &mut triangles, edge_length_m, 70);
+            assert_eq!(result.unwrap_err(), TooFine { vertices_max: 70 });
+        }
     }
 }

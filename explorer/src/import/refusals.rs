@@ -165,6 +165,13 @@ fn clips_with_nan_are_refused() {
 }
 
 #[test]
+fn endless_clips_are_refused() {
+    let files = Files::new();
+    files.write("body.glb", Glb { key_s: 1e30, ..Default::default() }.bytes());
+    files.refused("body.glb", &["clip \"go\"", "frames"]);
+}
+
+#[test]
 fn motion_that_poses_cannot_hold_is_refused() {
     let files = Files::new();
     files.write("body.glb", Glb { animated: 0, ..Default::default() }.bytes());
@@ -248,6 +255,7 @@ fn scene_files_say_key_and_remedy() {
     refused(format!("{SCENE}colour = 3"), &["colour"]);
     refused(format!("speed = 3\n{SCENE}"), &["line 1", "speed"]);
     refused(SCENE.replace("\"box\"", "7"), &["line 2", "string"]);
+    refused(SCENE.replace("box", ""), &["name", "1 to 256"]);
     refused(SCENE.replace("[character]", "fps = 1\n[character]"), &["fps", "5 to 240"]);
     let computed = SCENE.replace("file = \"graph.json\"", "");
     refused(computed.clone(), &["motion_graph", "exactly one of file, threshold_m, reach_s"]);

@@ -27,7 +27,7 @@ pub fn retarget(name: &str, bvh: &Bvh, skeleton: &Skeleton, fps: f32) -> Result<
     let legs = Legs::find(skeleton)?;
     let scale = legs.length(|joint| skeleton.offsets[joint])
         / legs.length(|joint| map[joint].map_or(Vec3::ZERO, |source| bvh.joints[source].offset));
-    let frames = (bvh.duration_s() * fps).round() as usize + 1;
+    let frames = ((bvh.duration_s() * fps).round() as usize).saturating_add(1);
     if frames > POSES_MAX || !scale.is_finite() {
         return Err(BvhError::Skeleton(format!(
             "{frames} frames and a scale of {scale}: at most {POSES_MAX} frames are allowed, and \

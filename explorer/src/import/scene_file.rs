@@ -27,6 +27,7 @@
 
 use std::path::{Path, PathBuf};
 
+use protocol::limits::NAME_BYTES_MAX;
 use serde::Deserialize;
 
 use super::compute::Density;
@@ -205,7 +206,9 @@ impl SceneFile {
             return Err(SceneFileError::Garments(all.len()));
         }
         in_range("fps", file.fps, FPS)?;
-        file.garment()?;
+        named("name", &file.name)?;
+        let garment = file.garment()?;
+        named("garment.name", garment.name.as_ref().unwrap_or(&file.name))?;
         file.motion_source()?;
         file.exploration()?;
         Ok(file)
@@ -360,6 +363,14 @@ fn default_fps() -> f32 {
 
 fn value(key: &str, problem: &str) -> SceneFileError {
     SceneFileError::Value { key: key.to_owned(), problem: problem.to_owned() }
+}
+
+fn named(key: &str, name: &str) -> Result<(), SceneFileError> {
+    if (1..=NAME_BYTES_MAX).contains(&name.len()) {
+        Ok(())
+    } else {
+        Err(value(key, &format!("give 1 to {NAME_BYTES_MAX} bytes")))
+    }
 }
 
 fn in_range(key: &str, number: f32, [low, high]: [f32; 2]) -> Result<(), SceneFileError> {
