@@ -12,10 +12,12 @@
 //! `now` never goes backwards. All queues are bounded by [`limits`](crate::limits).
 
 mod client;
+mod error;
 mod server;
 mod wants;
 
-pub use client::{Client, ClientConfig, ClientEvent, SessionError};
+pub use client::{Client, ClientConfig, ClientEvent};
+pub use error::SessionError;
 pub use server::{Server, ServerConfig, ServerEvent};
 
 /// Microseconds since any fixed moment.
