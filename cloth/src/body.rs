@@ -43,6 +43,20 @@ impl Pose {
         Self { root: self.root.lerp(to.root, t), rotations: rotations.collect() }
     }
 
+    /// As [`Pose::interpolate`], into `self`, which keeps its memory.
+    pub fn interpolate_into(&mut self, from: &Self, to: &Self, t: f32) {
+        self.rotations.clear();
+        if t <= 0.0 || t >= 1.0 {
+            let end = if t <= 0.0 { from } else { to };
+            self.rotations.extend_from_slice(&end.rotations);
+            self.root = end.root;
+            return;
+        }
+        let pairs = from.rotations.iter().zip(&to.rotations);
+        self.rotations.extend(pairs.map(|(a, b)| a.slerp(*b, t)));
+        self.root = from.root.lerp(to.root, t);
+    }
+
     /// The same pose moved rigidly through the world.
     pub fn moved(&self, by: &Rigid) -> Self {
         let mut moved = self.clone();

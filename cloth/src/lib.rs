@@ -10,15 +10,18 @@
 //! function says otherwise.
 //!
 //! Map: [`rigid`] rigid transforms; [`body`] skeleton, poses, skinning; [`mesh`] garment
-//! topology; [`material`] physical constants; [`surface`], [`bvh`], [`triangle`] closest points of a
-//! moving surface; [`measure`] strain, penetration, clearance.
+//! topology; [`material`] physical constants; [`model`] what does not change during a run;
+//! [`solver`] the step; [`surface`], [`bvh`], [`triangle`] closest points of a moving surface;
+//! [`measure`] strain, penetration, clearance.
 
 pub mod body;
 pub mod bvh;
 pub mod material;
 pub mod measure;
 pub mod mesh;
+pub mod model;
 pub mod rigid;
+pub mod solver;
 pub mod surface;
 pub mod triangle;
 
@@ -26,5 +29,7 @@ pub use body::{Body, Pose, Skeleton};
 pub use glam::{Quat, Vec3};
 pub use material::Material;
 pub use mesh::{Mesh, MeshError};
+pub use model::{Environment, Model, ModelError, State};
 pub use rigid::Rigid;
+pub use solver::{Span, Workspace, step};
 pub use surface::Surface;

@@ -123,6 +123,14 @@ impl Surface {
         a * weights.x + b * weights.y + c * weights.z
     }
 
+    /// Two axes in a triangle's plane and its normal: a frame that is carried with the triangle.
+    pub fn triangle_frame(&self, posed: &Posed, triangle: u32) -> [Vec3; 3] {
+        let [a, b, c] = self.corners(posed, triangle);
+        let normal = (b - a).cross(c - a).normalize_or_zero();
+        let axis = (b - a).normalize_or_zero();
+        [axis, normal.cross(axis), normal]
+    }
+
     fn corners(&self, posed: &Posed, triangle: u32) -> [Vec3; 3] {
         self.triangles[triangle as usize].map(|v| posed.positions[v as usize])
     }

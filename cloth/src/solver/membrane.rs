@@ -1,0 +1,241 @@
+//! Stretch and shear: an isotropic energy of the two principal stretches of each triangle.
+//!
+//! Per rest area `mu sum (s_i - 1)^2 + lambda/2 (s_1 + s_2 - 2)^2`, and past `SOFT_STRAIN` a
+//! stiffer term: the strain limit. The Hessian in the space of the deformation gradient has known
+//! eigenvectors (Kim & Eberle 2022, "Dynamic Deformables", chapter 7, here for 3 x 2): scaling,
+//! twist, flip, and two turns out of the plane. Negative eigenvalues are set to zero.
+
+use glam::{Mat3A, Vec2, Vec3A};
+
+use super::matrix::{Matrix, Pattern};
+use crate::mesh::Mesh;
+
+/// Principal strain from which a triangle stiffens.
+pub(crate) const SOFT_STRAIN: f32 = 0.05;
+/// How much stiffer than Young's modulus the limit is.
+const LIMIT_FACTOR: f32 = 10.0;
+
+/// Where forces and their slopes are summed.
+pub(crate) struct Sums<'a> {
+    pub(crate) forces: &'a mut [Vec3A],
+    pub(crate) matrix: &'a mut Matrix,
+}
+
+/// Constants of the energy [N/m].
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Constants {
+    pub(crate) mu: f32,
+    pub(crate) lambda: f32,
+    pub(crate) limit: f32,
+}
+
+impl Constants {
+    /// From a material's stiffnesses.
+    pub(crate) fn new(material: &crate::Material) -> Self {
+        let (mu, lambda) = material.lame();
+        Self { mu, lambda, limit: LIMIT_FACTOR * material.stretch }
+    }
+}
+
+/// Adds each triangle's forces, and its Hessian times `scale`.
+pub(crate) fn assemble(
+    mesh: &Mesh,
+    pattern: &Pattern,
+    constants: Constants,
+    scale: f32,
+    x: &[Vec3A],
+    sums: Sums<'_>,
+) {
+    let Sums { forces, matrix } = sums;
+    let shapes = mesh.shape_gradients().iter().zip(mesh.rest_areas());
+    for ((t, (gradients, area)), slots) in
+        mesh.triangles().iter().zip(shapes).zip(&pattern.triangle_slots)
+    {
+        let [i, j, k] = t.map(|v| v as usize);
+        let e = Element::new([x[i], x[j], x[k]], gradients);
+        let (push, modes) = e.respond(constants);
+        let beta = gradients.map(|g| Vec2::new(e.v1.dot(g), e.v1.perp().dot(g)));
+        for (v, b) in [i, j, k].into_iter().zip(&beta) {
+            forces[v] -= (e.u1 * (push.x * b.x) + e.u2 * (push.y * b.y)) * *area;
+        }
+        let block = |a: usize, b: usize| e.block(&modes, beta[a], beta[b], area * scale);
+        let (h01, h02, h12) = (block(0, 1), block(0, 2), block(1, 2));
+        let (h10, h20, h21) = (h01.transpose(), h02.transpose(), h12.transpose());
+        for (slot, h) in slots.iter().zip([h01, h10, h02, h20, h12, h21]) {
+            matrix.near[*slot as usize] += h;
+        }
+        // A shift of the whole triangle costs nothing: rows sum to zero.
+        matrix.diagonal[i] -= h01 + h02;
+        matrix.diagonal[j] -= h10 + h12;
+        matrix.diagonal[k] -= h20 + h21;
+    }
+}
+
+/// A triangle's deformation: principal directions in space and in the rest plane, stretches.
+struct Element {
+    u1: Vec3A,
+    u2: Vec3A,
+    normal: Vec3A,
+    v1: Vec2,
+    stretch: Vec2,
+}
+
+/// Eigenvalues of the Hessian, in pairs of coordinates `g_ij = u_i . dF v_j`.
+struct Modes {
+    s11: f32,
+    s22: f32,
+    s12: f32,
+    /// g12 and g21 with themselves, and with each other.
+    same: f32,
+    cross: f32,
+    out: Vec2,
+}
+
+impl Element {
+    fn new(x: [Vec3A; 3], g: &[Vec2; 3]) -> Self {
+        let f1 = x[0] * g[0].x + x[1] * g[1].x + x[2] * g[2].x;
+        let f2 = x[0] * g[0].y + x[1] * g[1].y + x[2] * g[2].y;
+        let (c11, c22, c12) = (f1.dot(f1), f2.dot(f2), f1.dot(f2));
+        let (mean, half) = (0.5 * (c11 + c22), 0.5 * (c11 - c22));
+        let radius = (half * half + c12 * c12).sqrt();
+        // The eigenvector of the larger eigenvalue, from whichever form does not cancel.
+        let v1 =
+            if half >= 0.0 { Vec2::new(radius + half, c12) } else { Vec2::new(c12, radius - half) };
+        let v1 = v1.try_normalize().unwrap_or(Vec2::X);
+        let s1 = (mean + radius).sqrt().max(1e-4);
+        let cross = f1.cross(f2);
+        let s2 = cross.length() / s1;
+        let u1 = ((f1 * v1.x + f2 * v1.y) / s1).try_normalize().unwrap_or(Vec3A::X);
+        // Collapsed to a line there is no normal; any will do.
+        let across = cross - u1 * cross.dot(u1);
+        let normal = across.try_normalize().unwrap_or_else(|| u1.any_orthonormal_vector());
+        Self { u1, u2: normal.cross(u1), normal, v1, stretch: Vec2::new(s1, s2.max(1e-4)) }
+    }
+
+    /// Derivatives of the energy by the stretches, and the projected Hessian.
+    fn respond(&self, c: Constants) -> (Vec2, Modes) {
+        let s = self.stretch;
+        let over = (s - Vec2::splat(1.0 + SOFT_STRAIN)).max(Vec2::ZERO);
+        let trace = c.lambda * (s.x + s.y - 2.0);
+        let push = (s - 1.0) * (2.0 * c.mu) + trace + over * c.limit;
+        let stiff = |over: f32| if over > 0.0 { c.limit } else { 0.0 };
+        let (k1, k2) = (stiff(over.x), stiff(over.y));
+        let difference = s.x - s.y;
+        let flip = if difference > 1e-4 {
+            2.0 * c.mu + c.limit * (over.x - over.y) / difference
+        } else {
+            2.0 * c.mu + k1
+        };
+        let twist = ((push.x + push.y) / (s.x + s.y)).max(0.0);
+        let modes = Modes {
+            s11: 2.0 * c.mu + c.lambda + k1,
+            s22: 2.0 * c.mu + c.lambda + k2,
+            s12: c.lambda,
+            same: 0.5 * (twist + flip),
+            cross: 0.5 * (flip - twist),
+            out: (push / s).max(Vec2::ZERO),
+        };
+        (push, modes)
+    }
+
+    fn block(&self, m: &Modes, a: Vec2, b: Vec2, scale: f32) -> Mat3A {
+        let (a, xx, yy) = (a * scale, b.x, b.y);
+        let h11 = m.s11 * a.x * xx + m.same * a.y * yy;
+        let h22 = m.s22 * a.y * yy + m.same * a.x * xx;
+        let h12 = m.s12 * a.x * yy + m.cross * a.y * xx;
+        let h21 = m.s12 * a.y * xx + m.cross * a.x * yy;
+        let hnn = m.out.x * a.x * xx + m.out.y * a.y * yy;
+        let w1 = self.u1 * h11 + self.u2 * h12;
+        let w2 = self.u1 * h21 + self.u2 * h22;
+        let wn = self.normal * hnn;
+        let column = |j: usize| self.u1 * w1[j] + self.u2 * w2[j] + self.normal * wn[j];
+        Mat3A::from_cols(column(0), column(1), column(2))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Material, Vec3};
+
+    fn triangle() -> Mesh {
+        let rest = vec![Vec3::ZERO, Vec3::X, Vec3::new(0.3, 0.8, 0.0)];
+        Mesh::new(rest, vec![[0, 1, 2]]).unwrap()
+    }
+
+    fn at(mesh: &Mesh, x: &[Vec3A]) -> (Vec<Vec3A>, Matrix) {
+        let pattern = Pattern::new(mesh);
+        let mut forces = vec![Vec3A::ZERO; 3];
+        let mut matrix = Matrix {
+            diagonal: vec![Mat3A::ZERO; 3],
+            near: vec![Mat3A::ZERO; pattern.near.columns.len()],
+            far: Vec::new(),
+        };
+        let c = Constants::new(&Material::default());
+        assemble(mesh, &pattern, c, 1.0, x, Sums { forces: &mut forces, matrix: &mut matrix });
+        (forces, matrix)
+    }
+
+    #[test]
+    fn the_hessian_is_the_slope_of_the_forces_where_it_is_positive() {
+        // Stretched in both directions (no eigenvalue is cut off), once past the limit.
+        for grow in [1.03, 1.2] {
+            let mesh = triangle();
+            let pattern = Pattern::new(&mesh);
+            let turn = glam::Quat::from_rotation_x(0.7);
+            let x: Vec<Vec3A> =
+                mesh.rest_positions().iter().map(|p| Vec3A::from(turn * (*p * grow))).collect();
+            let (_, matrix) = at(&mesh, &x);
+            let step = 1e-3;
+            for axis in 0..9 {
+                let mut d = vec![Vec3A::ZERO; 3];
+                d[axis / 3][axis % 3] = step;
+                let moved = |sign: f32| -> Vec<Vec3A> {
+                    x.iter().zip(&d).map(|(x, d)| *x + *d * sign).collect()
+                };
+                let (f1, f0) = (at(&mesh, &moved(1.0)).0, at(&mesh, &moved(-1.0)).0);
+                let mut predicted = vec![Vec3A::ZERO; 3];
+                matrix.multiply(&pattern, &d, &mut predicted);
+                for v in 0..3 {
+                    let slope = (f0[v] - f1[v]) * 0.5;
+                    let error = (slope - predicted[v]).length();
+                    assert!(error < 0.02 * step * 1000.0, "{grow} {axis} {v}: {error}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_turned_or_shifted_triangle_feels_nothing() {
+        let mesh = triangle();
+        let turn = glam::Quat::from_rotation_z(2.0) * glam::Quat::from_rotation_x(1.0);
+        let x: Vec<Vec3A> =
+            mesh.rest_positions().iter().map(|p| Vec3A::from(turn * *p + Vec3::Y)).collect();
+        assert!(at(&mesh, &x).0.iter().all(|f| f.length() < 1e-3));
+    }
+
+    #[test]
+    fn any_shape_even_a_collapsed_one_has_a_positive_finite_hessian() {
+        let mesh = triangle();
+        let pattern = Pattern::new(&mesh);
+        let shapes = [
+            [Vec3A::ZERO, Vec3A::ZERO, Vec3A::ZERO],
+            [Vec3A::ZERO, Vec3A::X, Vec3A::X * 0.5],
+            [Vec3A::ZERO, Vec3A::X * 0.2, Vec3A::Y * 0.1],
+            [Vec3A::ZERO, Vec3A::X * -3.0, Vec3A::Z * 2.0],
+        ];
+        for x in shapes {
+            let (forces, matrix) = at(&mesh, &x);
+            assert!(forces.iter().all(|f| f.is_finite()));
+            for i in 0..200 {
+                let part = |k: i32| ((i * 37 + k * 11) % 17) as f32 - 8.0;
+                let d: Vec<Vec3A> =
+                    (0..3).map(|v| Vec3A::new(part(v), part(v + 5), part(v + 9))).collect();
+                let mut ad = d.clone();
+                matrix.multiply(&pattern, &d, &mut ad);
+                let energy: f32 = d.iter().zip(&ad).map(|(a, b)| a.dot(*b)).sum();
+                assert!(energy.is_finite() && energy > -0.1, "{energy}");
+            }
+        }
+    }
+}

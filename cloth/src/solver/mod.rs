@@ -1,0 +1,404 @@
+//! The step: implicit Euler, two projected Newton passes per substep.
+//!
+//! The first pass keeps the cloth off the contact planes found at the substep's beginning, the
+//! second, linearised where the first ended, off those found at its end. Baraff & Witkin 1998 for
+//! the implicit system, Kim & Eberle 2022 for projection; contact and limits as their modules say.
+
+pub(crate) mod bending;
+pub(crate) mod contact;
+pub(crate) mod limit;
+pub(crate) mod matrix;
+pub(crate) mod membrane;
+
+use glam::{Mat3A, Vec3, Vec3A};
+
+use crate::body::Pose;
+use crate::model::{Model, State};
+use crate::rigid::Rigid;
+use crate::surface::Posed;
+use contact::{Friction, Kind, Near, Row};
+use matrix::{Given, Matrix, Scratch, Stop};
+
+/// Longest substep [s].
+pub const SUBSTEP_S_MAX: f32 = 1.0 / 120.0;
+/// The body moves at most this far in a substep where that takes no more than 4 times as many [m].
+const BODY_WAY_M: f32 = 0.03;
+/// Vertices deeper inside than this at a frame's beginning are given up to the cloth around [m].
+const DEPTH_FOUND_M: f32 = 0.12;
+/// No vertex moves faster [m/s].
+pub const SPEED_MAX_M_S: f32 = 40.0;
+
+const FIRST: Stop = Stop { tolerance: 1e-3, iterations: 120 };
+const SECOND: Stop = Stop { tolerance: 1e-3, iterations: 60 };
+
+/// What happens during a step.
+#[derive(Debug, Clone, Copy)]
+pub struct Span<'a> {
+    /// The body's pose at the beginning and at the end; without a body nothing.
+    pub motion: Option<(&'a Pose, &'a Pose)>,
+    /// How long it takes [s].
+    pub seconds: f32,
+    /// 1, or by how much finer than usual to divide it.
+    pub refine: u32,
+}
+
+/// What a step took.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Effort {
+    /// Substeps.
+    pub substeps: u32,
+    /// Iterations of conjugate gradients.
+    pub iterations: u32,
+    /// Sweeps of the strain limit.
+    pub sweeps: u32,
+}
+
+/// A step that came out of bounds.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("vertex {vertex} is at {position} in substep {substep} of {substeps}")]
+pub struct StepError {
+    /// The first vertex that is not finite.
+    pub vertex: usize,
+    /// Where it is.
+    pub position: Vec3,
+    /// Substep in which it happened.
+    pub substep: u32,
+    /// Of how many.
+    pub substeps: u32,
+}
+
+/// Scratch of the step; holds nothing that a later step depends on.
+#[derive(Debug, Clone, Default)]
+pub struct Workspace {
+    pose: Option<Pose>,
+    joints: Vec<Rigid>,
+    from: Posed,
+    to: Posed,
+    x: Vec<Vec3A>,
+    v: Vec<Vec3A>,
+    dx: Vec<Vec3A>,
+    guess: Vec<Vec3A>,
+    linear: Vec<Vec3A>,
+    forces: Vec<Vec3A>,
+    normals: Vec<Vec3A>,
+    reference: Vec<Vec3A>,
+    near: Vec<Near>,
+    rows: Vec<Row>,
+    ground: Vec<Row>,
+    loads: Vec<[f32; 2]>,
+    held: Vec<bool>,
+    inverse_masses: Vec<f32>,
+    matrix: Matrix,
+    scratch: Scratch,
+}
+
+/// Moves `state` on by `span.seconds`; equal inputs give equal bits, whatever `workspace` served
+/// for before.
+///
+/// # Errors
+/// A position or velocity that is not finite; `state` is then of no use.
+pub fn step(
+    model: &Model,
+    span: &Span<'_>,
+    state: &mut State,
+    workspace: &mut Workspace,
+) -> Result<Effort, StepError> {
+    let ws = workspace;
+    ws.begin(model, state);
+    let way = ws.body_way(model, span);
+    let base = ((span.seconds / SUBSTEP_S_MAX) - 1e-3).ceil().max(1.0) as u32;
+    let finer = ((way / (BODY_WAY_M * base as f32)).ceil().max(1.0) as u32).next_power_of_two();
+    let substeps = base * finer.min(4) * span.refine.max(1);
+    let dt = span.seconds / substeps as f32;
+    let body_way = way / substeps as f32;
+    ws.find_all(model, dt, body_way);
+    let mut effort = Effort { substeps, ..Effort::default() };
+    for substep in 0..substeps {
+        if let Some((from, to)) = span.motion {
+            ws.pose_body(model, from, to, (substep + 1) as f32 / substeps as f32);
+        }
+        ws.substep(model, dt, body_way, &mut effort);
+        let finite = |(x, v): (&Vec3A, &Vec3A)| x.is_finite() && v.is_finite();
+        if let Some(vertex) = ws.x.iter().zip(&ws.v).position(|p| !finite(p)) {
+            let position = ws.x[vertex].into();
+            return Err(StepError { vertex, position, substep, substeps });
+        }
+        std::mem::swap(&mut ws.from, &mut ws.to);
+    }
+    for (i, (x, v)) in ws.x.iter().zip(&ws.v).enumerate() {
+        state.positions[i] = (*x).into();
+        state.velocities[i] = (*v).into();
+    }
+    Ok(effort)
+}
+
+impl Workspace {
+    /// The body's surface where the last step left it.
+    pub fn body(&self) -> &Posed {
+        &self.from
+    }
+
+    fn begin(&mut self, model: &Model, state: &State) {
+        let count = model.mesh.vertex_count();
+        assert_eq!(state.positions.len(), count, "a state has as many vertices as its model");
+        assert_eq!(state.velocities.len(), count, "a state has as many vertices as its model");
+        self.x.clear();
+        self.x.extend(state.positions.iter().map(|p| Vec3A::from(*p)));
+        self.v.clear();
+        self.v.extend(state.velocities.iter().map(|v| Vec3A::from(*v)));
+        for list in [&mut self.dx, &mut self.guess, &mut self.linear, &mut self.forces] {
+            list.clear();
+            list.resize(count, Vec3A::ZERO);
+        }
+        self.normals.resize(count, Vec3A::ZERO);
+        self.scratch.residual.resize(count, Vec3A::ZERO);
+        self.rows.resize(count, Row::default());
+        self.ground.resize(count, Row::default());
+        self.loads.clear();
+        self.loads.resize(count, [0.0; 2]);
+        self.matrix.diagonal.resize(count, Mat3A::ZERO);
+        self.matrix.near.resize(model.pattern.near.columns.len(), Mat3A::ZERO);
+        self.matrix.far.resize(model.pattern.far.columns.len(), 0.0);
+        self.held.clear();
+        self.held.resize(count, false);
+        self.inverse_masses.clear();
+        self.inverse_masses.extend(model.masses.iter().map(|m| 1.0 / m));
+        self.reference.clear();
+        self.reference.extend(model.masses.iter().map(|m| Vec3A::Y * (9.81 * m)));
+        for a in &model.attachments {
+            self.held[a.vertex as usize] = true;
+            self.inverse_masses[a.vertex as usize] = 0.0;
+        }
+    }
+
+    /// Poses the body at the beginning; returns the longest way of a point of its surface, less
+    /// the root's own shift [m].
+    fn body_way(&mut self, model: &Model, span: &Span<'_>) -> f32 {
+        let (Some(character), Some((from, to))) = (&model.body, span.motion) else { return 0.0 };
+        character.body.skin(from, &mut self.joints, &mut self.from.positions);
+        character.body.skin(to, &mut self.joints, &mut self.to.positions);
+        character.surface.refit(&mut self.from);
+        let shift = to.root - from.root;
+        let ends = self.from.positions.iter().zip(&self.to.positions);
+        ends.map(|(a, b)| (*b - *a - shift).length_squared()).fold(0.0, f32::max).sqrt()
+    }
+
+    fn pose_body(&mut self, model: &Model, from: &Pose, to: &Pose, t: f32) {
+        let Some(character) = &model.body else { return };
+        let pose = self.pose.get_or_insert_with(|| from.clone());
+        pose.interpolate_into(from, to, t);
+        character.body.skin(pose, &mut self.joints, &mut self.to.positions);
+        character.surface.refit(&mut self.to);
+    }
+
+    fn find_all(&mut self, model: &Model, dt: f32, body_way: f32) {
+        self.near.clear();
+        for (x, v) in self.x.iter().zip(&self.v) {
+            let reach = contact::reach(model.material.offset, v.length() * dt, body_way);
+            let reach = reach.max(DEPTH_FOUND_M);
+            self.near.push(Near::find(model, &self.from, (*x).into(), reach));
+        }
+    }
+
+    fn substep(&mut self, model: &Model, dt: f32, body_way: f32, effort: &mut Effort) {
+        effort.substeps = effort.substeps.max(1);
+        self.set_guess(model, dt);
+        self.carry_rows(model, dt);
+        self.linear.fill(Vec3A::ZERO);
+        effort.iterations += self.pass(model, dt, true);
+        self.find_rows(model, dt, body_way);
+        self.linear.copy_from_slice(&self.dx);
+        self.guess.fill(Vec3A::ZERO);
+        effort.iterations += self.pass(model, dt, false);
+        effort.sweeps += self.finish(model, dt);
+    }
+
+    /// First guess of the way of each vertex: on by its velocity; held vertices go where they
+    /// are led.
+    fn set_guess(&mut self, model: &Model, dt: f32) {
+        for (guess, v) in self.guess.iter_mut().zip(&self.v) {
+            *guess = *v * dt;
+        }
+        for a in &model.attachments {
+            let i = a.vertex as usize;
+            self.guess[i] = match &model.body {
+                Some(c) => Vec3A::from(a.place(&c.surface, &self.to)) - self.x[i],
+                None => Vec3A::ZERO,
+            };
+        }
+    }
+
+    fn carry_rows(&mut self, model: &Model, dt: f32) {
+        let offset = model.material.offset;
+        let fall = Vec3A::from(model.environment.gravity) * (dt * dt);
+        for i in 0..self.x.len() {
+            let ahead = self.x[i] + self.guess[i] + fall;
+            let mut row = Row::default();
+            if let Some(c) = &model.body {
+                let near = &self.near[i];
+                row = near.carried(&c.surface, &self.from, &self.to);
+                row = row.keep(offset, near.distance, dt);
+            }
+            self.rows[i] = if meets(&row, ahead) { row } else { Row::default() };
+            self.ground[i] = ground_row(model, ahead);
+        }
+    }
+
+    /// Looks for the body where the first pass has led each vertex.
+    fn find_rows(&mut self, model: &Model, dt: f32, body_way: f32) {
+        let offset = model.material.offset;
+        for i in 0..self.x.len() {
+            let at = self.x[i] + self.dx[i];
+            self.loads[i] = [self.rows[i].load(at), self.ground[i].load(at)];
+            self.ground[i] = ground_row(model, at);
+            let Some(c) = &model.body else { continue };
+            let reach = contact::reach(offset, self.dx[i].length(), body_way);
+            let start = if self.near[i].found { self.near[i].distance } else { offset };
+            let inside = (-start).max(0.0);
+            let near = Near::find(model, &self.to, at.into(), reach + inside);
+            self.near[i] = near;
+            self.rows[i] = near.ended(&c.surface, &self.from, &self.to).keep(offset, start, dt);
+        }
+    }
+
+    /// One Newton pass: linearised at `linear`, started from `guess`, into `dx`.
+    fn pass(&mut self, model: &Model, dt: f32, first: bool) -> u32 {
+        let stop = if first { FIRST } else { SECOND };
+        for ((at, x), way) in self.dx.iter_mut().zip(&self.x).zip(&self.linear) {
+            *at = *x + *way;
+        }
+        self.assemble(model, dt);
+        self.add_air(model, dt);
+        self.add_contacts(model, dt, first);
+        let pattern = &model.pattern;
+        // The guess enters the residual; its held entries are what held vertices are led by.
+        self.matrix.multiply(pattern, &self.guess, &mut self.forces);
+        for (r, f) in self.scratch.residual.iter_mut().zip(&self.forces) {
+            *r -= *f;
+        }
+        let (held, reference) = (&self.held[..], &self.reference[..]);
+        let given = Given { pattern, held, reference, stop };
+        let iterations = self.matrix.solve(given, &mut self.guess, &mut self.scratch);
+        for ((dx, way), more) in self.dx.iter_mut().zip(&self.linear).zip(&self.guess) {
+            *dx = *way + *more;
+        }
+        iterations
+    }
+
+    /// Matrix and residual of inertia, gravity, bending, membrane and damping; `dx` holds the
+    /// positions at which the forces are taken.
+    fn assemble(&mut self, model: &Model, dt: f32) {
+        let lag = model.material.damping_s / dt;
+        let scale = 1.0 + lag;
+        let gravity = Vec3A::from(model.environment.gravity);
+        let (matrix, bending) = (&mut self.matrix, &model.bending);
+        for (block, w) in matrix.near.iter_mut().zip(&bending.near) {
+            *block = Mat3A::from_diagonal(Vec3::splat(w * scale));
+        }
+        for (far, w) in matrix.far.iter_mut().zip(&bending.far) {
+            *far = w * scale;
+        }
+        for (d, w) in matrix.diagonal.iter_mut().zip(&bending.diagonal) {
+            *d = Mat3A::from_diagonal(Vec3::splat(w * scale));
+        }
+        for (f, m) in self.forces.iter_mut().zip(&model.masses) {
+            *f = gravity * *m;
+        }
+        bending.add_forces(&model.pattern, &self.dx, &mut self.forces);
+        let constants = membrane::Constants::new(&model.material);
+        let (mesh, pattern) = (&model.mesh, &model.pattern);
+        let sums = membrane::Sums { forces: &mut self.forces, matrix: &mut *matrix };
+        membrane::assemble(mesh, pattern, constants, scale, &self.dx, sums);
+        matrix.multiply(pattern, &self.linear, &mut self.scratch.residual);
+        let damp = lag / scale;
+        for (i, r) in self.scratch.residual.iter_mut().enumerate() {
+            let m = model.masses[i] / (dt * dt);
+            *r = self.forces[i] - *r * damp + (self.v[i] * dt - self.linear[i]) * m;
+            matrix.diagonal[i] += Mat3A::from_diagonal(Vec3::splat(m));
+        }
+    }
+
+    /// Drag on each vertex's share of the sheet, along the sheet's normal.
+    fn add_air(&mut self, model: &Model, dt: f32) {
+        let factor = 0.5 * model.environment.air_density * model.material.drag;
+        if factor <= 0.0 {
+            return;
+        }
+        self.normals.fill(Vec3A::ZERO);
+        for t in model.mesh.triangles() {
+            let [i, j, k] = t.map(|v| v as usize);
+            let n = (self.x[j] - self.x[i]).cross(self.x[k] - self.x[i]);
+            for v in [i, j, k] {
+                self.normals[v] += n;
+            }
+        }
+        let wind = Vec3A::from(model.environment.wind);
+        for (i, area) in model.mesh.vertex_areas().iter().enumerate() {
+            let n = self.normals[i].normalize_or_zero();
+            let speed = n.dot(self.v[i] - wind);
+            let c = factor * area * speed.abs() / dt;
+            self.matrix.diagonal[i] += Mat3A::from_cols(n * n.x, n * n.y, n * n.z) * c;
+            self.scratch.residual[i] -= n * (n.dot(self.linear[i] - wind * dt) * c);
+        }
+    }
+
+    /// Rows and friction. Those of the first pass have been chosen by where vertices head; those
+    /// of the second act where the first pass has led a vertex too near.
+    fn add_contacts(&mut self, model: &Model, dt: f32, first: bool) {
+        for i in 0..self.x.len() {
+            if self.held[i] {
+                continue;
+            }
+            let (x, dx, way) = (self.x[i], self.linear[i], self.v[i] * dt);
+            let diagonal = &mut self.matrix.diagonal[i];
+            let force = &mut self.scratch.residual[i];
+            let mut add = |row: &Row, coefficient, load| {
+                let acts = row.kind == Kind::Plane && (first || row.gap(x + dx) < 0.0);
+                if acts || row.kind == Kind::Held {
+                    let friction = Friction { coefficient, load, way, dt };
+                    row.add(x, dx, friction, diagonal, force);
+                }
+            };
+            add(&self.rows[i], model.material.friction, self.loads[i][0]);
+            add(&self.ground[i], model.environment.ground_friction, self.loads[i][1]);
+        }
+    }
+
+    /// Strain limit, new velocities and positions.
+    fn finish(&mut self, model: &Model, dt: f32) -> u32 {
+        let count = self.x.len();
+        let ends = &mut self.linear;
+        for ((end, x), dx) in ends.iter_mut().zip(&self.x).zip(&self.dx) {
+            *end = *x + *dx;
+        }
+        for (i, end) in ends.iter().enumerate() {
+            self.loads[i] = [self.rows[i].load(*end), self.ground[i].load(*end)];
+        }
+        let sweeps = limit::project(&model.mesh, &self.inverse_masses, &self.rows, ends);
+        for i in 0..count {
+            let mut way = if sweeps > 0 { ends[i] - self.x[i] } else { self.dx[i] };
+            if !self.held[i] {
+                for (row, load) in [&self.rows[i], &self.ground[i]].into_iter().zip(self.loads[i]) {
+                    if load > 0.0 {
+                        way = row.without_bounce(way);
+                    }
+                }
+            }
+            self.v[i] = (way / dt).clamp_length_max(SPEED_MAX_M_S);
+            self.x[i] = ends[i];
+            if let Some(c) = &model.body {
+                self.near[i].moved(&c.surface, &self.to, ends[i].into());
+            }
+        }
+        sweeps
+    }
+}
+
+fn meets(row: &Row, at: Vec3A) -> bool {
+    row.kind == Kind::Held || row.kind == Kind::Plane && row.gap(at) < 0.0
+}
+
+fn ground_row(model: &Model, at: Vec3A) -> Row {
+    let offset = model.material.offset;
+    if model.environment.ground && at.y < offset { Row::ground(at, offset) } else { Row::default() }
+}
