@@ -60,6 +60,8 @@ pub struct Model {
     pub(crate) environment: Environment,
     pub(crate) body: Option<Character>,
     pub(crate) attachments: Vec<Attachment>,
+    /// Edges between held vertices, with their rest lengths [m].
+    pub(crate) held_edges: Vec<([u32; 2], f32)>,
     /// Vertex masses [kg].
     pub(crate) masses: Vec<f32>,
     pub(crate) pattern: Pattern,
@@ -128,10 +130,14 @@ impl Model {
             body,
         });
         let pattern = Pattern::new(&mesh);
+        let held = |v: u32| attached.binary_search(&v).is_ok();
+        let edges = mesh.edges().iter().copied().zip(mesh.rest_lengths().iter().copied());
+        let held_edges = edges.filter(|(e, _)| held(e[0]) && held(e[1])).collect();
         Ok(Self {
             attachments: attach(&mesh, body.as_ref(), attached),
             masses: mesh.vertex_areas().iter().map(|a| a * material.density).collect(),
             bending: bending::Stiffness::new(&mesh, &pattern, material.bend),
+            held_edges,
             pattern,
             mesh,
             material,

@@ -7,6 +7,7 @@
 //! Non-goals: who is connected (they meet in the store), what a region's bytes mean (`codec`).
 
 pub mod builtin;
+pub mod cloth_simulator;
 pub mod explore;
 pub mod grid;
 pub mod grow;

@@ -12,26 +12,45 @@ const STRAIN_DONE: f32 = 0.115;
 const SWEEPS: u32 = 60;
 
 /// Gauss-Seidel over the edges in their order, each shortened to `STRAIN_MAX` (Provot 1995, with
-/// masses), in turn with the contact planes. Returns the sweeps made: 0 in calm motion.
+/// masses), in turn with the contact planes. Where planes and edges contradict each other, as
+/// between an arm and the chest, the edges have the last word. Returns the sweeps made: 0 in calm
+/// motion.
 pub(crate) fn project(mesh: &Mesh, inverse_masses: &[f32], rows: &[Row], x: &mut [Vec3A]) -> u32 {
-    for sweep in 0..SWEEPS {
-        let worst = shorten(mesh, inverse_masses, x);
+    let edges = || mesh.edges().iter().copied().zip(mesh.rest_lengths().iter().copied());
+    for sweep in 0..2 * SWEEPS {
+        let worst = shorten(edges(), inverse_masses, x);
         if worst <= 1.0 + STRAIN_DONE {
             return sweep;
         }
-        for ((x, row), w) in x.iter_mut().zip(rows).zip(inverse_masses) {
-            if row.kind == Kind::Plane && *w > 0.0 {
+        if sweep >= SWEEPS {
+            continue;
+        }
+        for (x, row) in x.iter_mut().zip(rows) {
+            if row.kind == Kind::Plane {
                 *x = row.push_out(*x);
             }
         }
     }
-    SWEEPS
+    2 * SWEEPS
+}
+
+/// Shortens edges between held vertices where the skin that leads them stretches too far.
+pub(crate) fn tighten(edges: &[([u32; 2], f32)], inverse_masses: &[f32], x: &mut [Vec3A]) {
+    for _ in 0..SWEEPS {
+        if shorten(edges.iter().copied(), inverse_masses, x) <= 1.0 + STRAIN_DONE {
+            break;
+        }
+    }
 }
 
 /// One sweep; returns the largest ratio of length to rest length that it met.
-fn shorten(mesh: &Mesh, inverse_masses: &[f32], x: &mut [Vec3A]) -> f32 {
+fn shorten(
+    edges: impl Iterator<Item = ([u32; 2], f32)>,
+    inverse_masses: &[f32],
+    x: &mut [Vec3A],
+) -> f32 {
     let mut worst = 0.0f32;
-    for (e, rest) in mesh.edges().iter().zip(mesh.rest_lengths()) {
+    for (e, rest) in edges {
         let (a, b) = (e[0] as usize, e[1] as usize);
         let d = x[b] - x[a];
         let most = rest * (1.0 + STRAIN_MAX);
@@ -40,9 +59,6 @@ fn shorten(mesh: &Mesh, inverse_masses: &[f32], x: &mut [Vec3A]) -> f32 {
             continue;
         }
         let (wa, wb) = (inverse_masses[a], inverse_masses[b]);
-        if wa + wb <= 0.0 {
-            continue;
-        }
         let length = length2.sqrt();
         worst = worst.max(length / rest);
         let correction = d * ((length - most) / (length * (wa + wb)));

@@ -21,10 +21,12 @@ use matrix::{Given, Matrix, Scratch, Stop};
 
 /// Longest substep [s].
 pub const SUBSTEP_S_MAX: f32 = 1.0 / 120.0;
-/// The body moves at most this far in a substep where that takes no more than 4 times as many [m].
+/// The body moves at most this far in a substep where that takes no more than 8 times as many [m].
 const BODY_WAY_M: f32 = 0.03;
 /// Vertices deeper inside than this at a frame's beginning are given up to the cloth around [m].
 const DEPTH_FOUND_M: f32 = 0.12;
+/// How readily a held vertex gives way to the strain limit, against a free one.
+const HELD_SHARE: f32 = 0.02;
 /// No vertex moves faster [m/s].
 pub const SPEED_MAX_M_S: f32 = 40.0;
 
@@ -108,7 +110,7 @@ pub fn step(
     let way = ws.body_way(model, span);
     let base = ((span.seconds / SUBSTEP_S_MAX) - 1e-3).ceil().max(1.0) as u32;
     let finer = ((way / (BODY_WAY_M * base as f32)).ceil().max(1.0) as u32).next_power_of_two();
-    let substeps = base * finer.min(4) * span.refine.max(1);
+    let substeps = base * finer.min(8) * span.refine.max(1);
     let dt = span.seconds / substeps as f32;
     let body_way = way / substeps as f32;
     ws.find_all(model, dt, body_way);
@@ -167,7 +169,7 @@ impl Workspace {
         self.reference.extend(model.masses.iter().map(|m| Vec3A::Y * (9.81 * m)));
         for a in &model.attachments {
             self.held[a.vertex as usize] = true;
-            self.inverse_masses[a.vertex as usize] = 0.0;
+            self.inverse_masses[a.vertex as usize] *= HELD_SHARE;
         }
     }
 
@@ -219,12 +221,17 @@ impl Workspace {
         for (guess, v) in self.guess.iter_mut().zip(&self.v) {
             *guess = *v * dt;
         }
+        let Some(c) = &model.body else {
+            model.attachments.iter().for_each(|a| self.guess[a.vertex as usize] = Vec3A::ZERO);
+            return;
+        };
+        for a in &model.attachments {
+            self.linear[a.vertex as usize] = a.place(&c.surface, &self.to).into();
+        }
+        limit::tighten(&model.held_edges, &self.inverse_masses, &mut self.linear);
         for a in &model.attachments {
             let i = a.vertex as usize;
-            self.guess[i] = match &model.body {
-                Some(c) => Vec3A::from(a.place(&c.surface, &self.to)) - self.x[i],
-                None => Vec3A::ZERO,
-            };
+            self.guess[i] = self.linear[i] - self.x[i];
         }
     }
 
@@ -366,7 +373,6 @@ impl Workspace {
 
     /// Strain limit, new velocities and positions.
     fn finish(&mut self, model: &Model, dt: f32) -> u32 {
-        let count = self.x.len();
         let ends = &mut self.linear;
         for ((end, x), dx) in ends.iter_mut().zip(&self.x).zip(&self.dx) {
             *end = *x + *dx;
@@ -375,8 +381,8 @@ impl Workspace {
             self.loads[i] = [self.rows[i].load(*end), self.ground[i].load(*end)];
         }
         let sweeps = limit::project(&model.mesh, &self.inverse_masses, &self.rows, ends);
-        for i in 0..count {
-            let mut way = if sweeps > 0 { ends[i] - self.x[i] } else { self.dx[i] };
+        for (i, end) in ends.iter().copied().enumerate() {
+            let mut way = if sweeps > 0 { end - self.x[i] } else { self.dx[i] };
             if !self.held[i] {
                 for (row, load) in [&self.rows[i], &self.ground[i]].into_iter().zip(self.loads[i]) {
                     if load > 0.0 {
@@ -385,9 +391,9 @@ impl Workspace {
                 }
             }
             self.v[i] = (way / dt).clamp_length_max(SPEED_MAX_M_S);
-            self.x[i] = ends[i];
+            self.x[i] = end;
             if let Some(c) = &model.body {
-                self.near[i].moved(&c.surface, &self.to, ends[i].into());
+                self.near[i].moved(&c.surface, &self.to, end.into());
             }
         }
         sweeps

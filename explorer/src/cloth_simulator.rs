@@ -1,0 +1,201 @@
+//! Our own simulator: the kernel of crate `cloth`, one frame along a primary edge at a time.
+//!
+//! The kernel runs in the world of the edge's source clip, shifted so that the source's hips stand
+//! over the origin; states enter and leave in the hips' frames and on the grid, so that nothing
+//! but a grid state passes from frame to frame.
+
+use std::sync::Arc;
+
+use cloth::{Environment, Mesh, Model, Pose, Rigid, Span, State, Vec3, Workspace, measure};
+use protocol::EdgeId;
+
+use crate::grid::GridState;
+use crate::scene::Scene;
+use crate::simulator::{Frame, FrameQuality, SimulateError, Simulator, SimulatorFactory};
+
+/// Vertices deeper in the body are counted [m].
+pub const DEEP_M: f32 = 0.005;
+/// A vertex of the garment in the rest pose may be this deep in the body [m]: it is led out.
+const REST_DEPTH_M: f32 = 0.001;
+
+/// Simulates a scene's garment. Not shared between threads; see [`ClothSimulatorFactory`].
+#[derive(Debug, Clone)]
+pub struct ClothSimulator {
+    scene: Arc<Scene>,
+    model: Arc<Model>,
+    workspace: Workspace,
+}
+
+/// Makes simulators that share one model.
+#[derive(Debug, Clone)]
+pub struct ClothSimulatorFactory {
+    scene: Arc<Scene>,
+    model: Arc<Model>,
+}
+
+impl ClothSimulatorFactory {
+    /// Checks the scene's garment and prepares its model.
+    ///
+    /// # Errors
+    /// A garment or material that the kernel refuses; the message names element and reason.
+    pub fn new(scene: &Scene) -> Result<Self, SimulateError> {
+        let garment = &scene.garment;
+        let refused = |what: String| SimulateError(format!("garment {}: {what}", garment.name));
+        let mesh = Mesh::new(garment.positions.clone(), garment.triangles.clone())
+            .map_err(|e| refused(e.to_string()))?;
+        let environment =
+            Environment { ground: scene.exploration.ground, ..Environment::default() };
+        let body = Some(scene.body.clone());
+        let model = Model::new(mesh, garment.fabric, environment, body, &garment.attached)
+            .map_err(|e| refused(e.to_string()))?;
+        Ok(Self { scene: Arc::new(scene.clone()), model: Arc::new(model) })
+    }
+
+    /// A simulator of its own.
+    pub fn make(&self) -> ClothSimulator {
+        ClothSimulator {
+            scene: self.scene.clone(),
+            model: self.model.clone(),
+            workspace: Workspace::default(),
+        }
+    }
+}
+
+impl SimulatorFactory for ClothSimulatorFactory {
+    fn simulator(&self) -> Box<dyn Simulator> {
+        Box::new(self.make())
+    }
+}
+
+impl ClothSimulator {
+    /// A simulator of the scene's garment.
+    ///
+    /// # Errors
+    /// As for [`ClothSimulatorFactory::new`].
+    pub fn new(scene: &Scene) -> Result<Self, SimulateError> {
+        Ok(ClothSimulatorFactory::new(scene)?.make())
+    }
+
+    /// The kernel's model.
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// Moves the body from one pose to another in `seconds`; states are in the poses' hips
+    /// frames. What comes out not finite is tried again at half the step.
+    fn advance(
+        &mut self,
+        state: &GridState,
+        from: &Pose,
+        to: &Pose,
+        seconds: f32,
+    ) -> Result<Frame, SimulateError> {
+        // Near the origin f32 is finest.
+        let home =
+            Rigid { translation: Vec3::new(-from.root.x, 0.0, -from.root.z), ..Rigid::IDENTITY };
+        let (from, to) = (from.moved(&home), to.moved(&home));
+        let mut failed = String::new();
+        for refine in [1, 2, 4] {
+            let mut world = to_world(state, &from.hips());
+            let span = Span { motion: Some((&from, &to)), seconds, refine };
+            match cloth::step(&self.model, &span, &mut world, &mut self.workspace) {
+                Ok(_) => match to_grid(&world, &to.hips()) {
+                    Ok(state) => return Ok(self.measured(state, &to)),
+                    Err(e) => failed = e.to_string(),
+                },
+                Err(e) => failed = e.to_string(),
+            }
+        }
+        Err(SimulateError(format!("the cloth left its bounds, also at a quarter step: {failed}")))
+    }
+
+    /// Measures a state as it will be kept: rounded.
+    fn measured(&self, state: GridState, pose: &Pose) -> Frame {
+        let world = to_world(&state, &pose.hips());
+        let mut quality = FrameQuality {
+            frames: 1,
+            vertex_frames: state.vertex_count() as u64,
+            stretch_max: measure::stretch_max(self.model.mesh(), &world.positions),
+            ..FrameQuality::default()
+        };
+        if let Some(surface) = self.model.surface() {
+            let offset = self.model.material().offset;
+            let body = self.workspace.body();
+            let found = measure::penetration(surface, body, &world.positions, DEEP_M, offset);
+            quality.deep_vertex_frames = found.deep;
+            quality.pinched_vertex_frames = found.pinched;
+            quality.depth_max_m = found.depth_max_m;
+        }
+        Frame { state, quality }
+    }
+
+    fn check_rest(&self) -> Result<(), SimulateError> {
+        let (body, garment) = (&self.scene.body, &self.scene.garment);
+        let at = measure::clearance(&body.rest_positions, &body.triangles, &garment.positions);
+        let worst = at.iter().enumerate().min_by(|a, b| a.1.total_cmp(b.1));
+        match worst {
+            Some((vertex, depth)) if *depth < -REST_DEPTH_M => {
+                let inside = at.iter().filter(|d| **d < 0.0).count();
+                Err(SimulateError(format!(
+                    "garment {}: {inside} vertices are inside the body in its rest pose, vertex \
+                     {vertex} by {:.1} mm; move them outside",
+                    garment.name,
+                    -depth * 1e3
+                )))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Simulator for ClothSimulator {
+    fn step(&mut self, state: &GridState, edge: EdgeId) -> Result<Frame, SimulateError> {
+        let scene = self.scene.clone();
+        let edge = scene.primary.edge(edge);
+        let from = &scene.primary.pose(edge.from).pose;
+        let to = scene.primary.pose(edge.to).pose.moved(&edge.alignment());
+        self.advance(state, from, &to, 1.0 / scene.primary.fps())
+            .map_err(|e| SimulateError(format!("pose {} to pose {}: {e}", edge.from, edge.to)))
+    }
+
+    fn drape(&mut self) -> Result<Frame, SimulateError> {
+        self.check_rest()?;
+        let scene = self.scene.clone();
+        let rest = scene.body.skeleton.rest_pose();
+        let start = &scene.primary.pose(scene.start).pose;
+        let seconds = 1.0 / scene.primary.fps();
+        let frames = scene.exploration.drape_frames.max(1);
+        let state = State {
+            positions: scene.garment.positions.clone(),
+            velocities: vec![Vec3::ZERO; scene.garment.positions.len()],
+        };
+        let mut state = to_grid(&state, &rest.hips()).map_err(|e| SimulateError(e.to_string()))?;
+        let mut from = rest.clone();
+        let mut quality = FrameQuality::default();
+        for frame in 1..=2 * frames {
+            let t = (frame as f32 / frames as f32).min(1.0);
+            let to = rest.interpolate(start, t * t * (3.0 - 2.0 * t));
+            let moved = self
+                .advance(&state, &from, &to, seconds)
+                .map_err(|e| SimulateError(format!("drape, frame {frame}: {e}")))?;
+            (state, quality, from) = (moved.state, moved.quality, to);
+        }
+        Ok(Frame { state, quality })
+    }
+}
+
+/// A grid state in the world, given its frame's place there.
+fn to_world(state: &GridState, hips: &Rigid) -> State {
+    let vertices = 0..state.vertex_count();
+    State {
+        positions: vertices.clone().map(|v| hips.point(state.position(v))).collect(),
+        velocities: vertices.map(|v| hips.vector(state.velocity(v))).collect(),
+    }
+}
+
+fn to_grid(world: &State, hips: &Rigid) -> Result<GridState, crate::grid::OffGrid> {
+    let inverse = hips.inverse();
+    let positions: Vec<Vec3> = world.positions.iter().map(|p| inverse.point(*p)).collect();
+    let velocities: Vec<Vec3> = world.velocities.iter().map(|v| inverse.vector(*v)).collect();
+    GridState::round(&positions, &velocities)
+}
