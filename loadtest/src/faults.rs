@@ -16,6 +16,8 @@ use rand_pcg::Pcg64Mcg;
 
 /// Largest datagram of noise.
 const DATAGRAM_BYTES_MAX: usize = 1400;
+/// Datagrams of noise that [`throw_garbage`] throws.
+const NOISE_DATAGRAMS: usize = 300;
 /// How long a server may take to answer a fault.
 const ANSWER_MAX: Duration = Duration::from_secs(15);
 
@@ -97,6 +99,20 @@ impl BrokenControl {
             Self::OtherProtocol => hello(PROTOCOL + 1),
         }
     }
+}
+
+/// All faults at once, on one port: noise, then every kind of broken control bytes, each on a
+/// connection of its own. Gives the server's answers.
+///
+/// # Errors
+/// As [`throw_noise`] and [`send_broken`].
+pub fn throw_garbage(
+    address: SocketAddr,
+    seed: u64,
+) -> anyhow::Result<Vec<(BrokenControl, Answer)>> {
+    throw_noise(address, NOISE_DATAGRAMS, seed)?;
+    let faults = BrokenControl::ALL.into_iter();
+    faults.map(|fault| Ok((fault, send_broken(address, None, fault)?))).collect()
 }
 
 /// How a server ended a connection.

@@ -136,7 +136,13 @@ impl Totals {
 #[derive(Debug)]
 pub struct Players {
     stop: Arc<AtomicBool>,
-    players: Vec<(Option<JoinHandle<()>>, Arc<Mutex<Report>>)>,
+    players: Vec<Player>,
+}
+
+#[derive(Debug)]
+struct Player {
+    thread: Option<JoinHandle<()>>,
+    report: Arc<Mutex<Report>>,
 }
 
 impl Players {
@@ -161,14 +167,14 @@ impl Players {
                     }
                 })
                 .with_context(|| format!("player {number} could not be started"))?;
-            players.push((Some(thread), report));
+            players.push(Player { thread: Some(thread), report });
         }
         Ok(Self { stop, players })
     }
 
     /// What each of them did so far.
     pub fn reports(&self) -> Vec<Report> {
-        self.players.iter().map(|(_, report)| lock(report).clone()).collect()
+        self.players.iter().map(|player| lock(&player.report).clone()).collect()
     }
 
     /// What all of them did so far.
@@ -184,9 +190,10 @@ impl Players {
 
     fn end(&mut self) {
         self.stop.store(true, Ordering::SeqCst);
-        for (number, (thread, report)) in self.players.iter_mut().enumerate() {
-            if thread.take().is_some_and(|thread| thread.join().is_err()) {
-                lock(report).error = Some(format!("the thread of player {number} panicked"));
+        for (number, player) in self.players.iter_mut().enumerate() {
+            if player.thread.take().is_some_and(|thread| thread.join().is_err()) {
+                lock(&player.report).error =
+                    Some(format!("the thread of player {number} panicked"));
             }
         }
     }
