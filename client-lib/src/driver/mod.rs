@@ -59,6 +59,10 @@ struct Driver {
     versions_applied: u64,
     bytes_before: u64,
     reported: Instant,
+    /// When it was last looked ahead; `None`: something has changed since.
+    planned: Option<Instant>,
+    /// The last request to look ahead that was answered.
+    answered: u64,
     leaving: Option<Instant>,
     ended: bool,
 }
@@ -86,6 +90,8 @@ impl Driver {
             versions_applied: 0,
             bytes_before: 0,
             reported: Instant::now(),
+            planned: None,
+            answered: 0,
             leaving: None,
             ended: false,
         }
@@ -138,7 +144,11 @@ impl Driver {
     fn work(&mut self) {
         let asked = self.shared.asked.load(Ordering::SeqCst);
         self.show_views();
-        self.plan(asked);
+        let due = self.planned.is_none_or(|at| at.elapsed() >= TICK);
+        if due || asked > self.answered {
+            self.planned = Some(Instant::now());
+            self.plan(asked);
+        }
         if self.reported.elapsed() >= REPORT {
             self.report();
         }
@@ -225,6 +235,7 @@ impl Driver {
     }
 
     fn take_version(&mut self, signed: &SignedManifest) {
+        self.planned = None;
         let manifest = &signed.manifest;
         let chosen = &self.config.garments;
         let played = |name: &String| chosen.is_empty() || chosen.contains(name);
@@ -272,6 +283,7 @@ impl Driver {
         if !any_new {
             return;
         }
+        self.planned = None;
         let shown = self.loaders.values().map(|l| l.current().map(|version| version.number()));
         if let Some(Some(number)) = shown.min() {
             self.session.applied(number);
@@ -304,6 +316,7 @@ impl Driver {
         wants.retain(|hash, _| !full.contains(hash));
         self.wanted = wants;
         if self.loaders.values().all(GarmentLoader::is_ahead) {
+            self.answered = asked;
             self.shared.answer(asked);
         }
     }
