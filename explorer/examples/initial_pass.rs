@@ -55,6 +55,7 @@ fn main() -> ExitCode {
     println!("drape {:.1} s, {:?}", begun.elapsed().as_secs_f32(), draped.quality);
     let poses = scene.primary.poses().len();
     let mut first: Vec<Option<GridState>> = vec![None; poses];
+    let mut seen = vec![false; poses];
     let mut starts = vec![scene.start.index()];
     if !clips.is_empty() {
         starts =
@@ -62,6 +63,7 @@ fn main() -> ExitCode {
     }
     let mut queue = VecDeque::new();
     for start in starts {
+        seen[start] = true;
         first[start] = Some(draped.state.clone());
         queue.push_back(start);
     }
@@ -69,19 +71,23 @@ fn main() -> ExitCode {
     let (mut seconds, mut failed) = (Vec::new(), 0);
     let mut worst: Vec<(FrameQuality, EdgeId)> = Vec::new();
     while let Some(pose) = queue.pop_front() {
+        let state = first[pose].take().expect("a pose in the queue has a state");
         for edge in scene.primary.out_edges(protocol::PoseId(pose as u32)) {
             let to = scene.primary.edge(edge).to.index();
             if seconds.len() >= limit || !wanted(to) {
                 continue;
             }
-            let state = first[pose].clone().expect("a pose in the queue has a state");
             let begun = Instant::now();
             match simulator.step(&state, edge) {
                 Ok(frame) => {
                     seconds.push(begun.elapsed().as_secs_f32());
                     total.add(&frame.quality);
                     worst.push((frame.quality, edge));
-                    if first[to].is_none() {
+                    if seconds.len() % 100 == 0 {
+                        eprintln!("{} frames, stretch_max {:.3}", seconds.len(), total.stretch_max);
+                    }
+                    if !seen[to] {
+                        seen[to] = true;
                         first[to] = Some(frame.state);
                         queue.push_back(to);
                     }
@@ -92,7 +98,6 @@ fn main() -> ExitCode {
                 }
             }
         }
-        first[pose] = first[pose].take().filter(|_| false);
     }
     report(&scene, &mut worst, &mut seconds);
     let deep = total.deep_vertex_frames as f64 / total.vertex_frames.max(1) as f64;
