@@ -12,6 +12,36 @@
 //! from functions that say so in their name (`wait_*`, `close`); the core knows no network, no
 //! file and no thread ([`walk`], a tool, reads its list from a file); neither explorer nor server is linked.
 //!
+//! ```no_run
+//! # #[cfg(feature = "driver")]
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! use client_lib::{Client, ClientConfig, StepOutcome, Walk, WalkSpec, decode};
+//! use std::time::Duration;
+//!
+//! let client = Client::connect(ClientConfig::new("127.0.0.1:4433"))?;
+//! client.wait_ready(Duration::from_secs(30))?;
+//! let mut character = client.character(None)?;
+//! let scene = client.scene(None)?;
+//! // A game decides by itself which pose comes next.
+//! let walk = Walk::new(&WalkSpec::Random(1), &scene, character.pose())?;
+//! let mut positions = vec![0.0; character.version().basis().rows()];
+//! for next_pose in walk.take(300) {
+//!     if let StepOutcome::Substituted { error_m } = character.step(next_pose) {
+//!         println!("off by {} mm", 1e3 * error_m);
+//!     }
+//!     for phase in [0.5, 1.0] {
+//!         character.sample(phase);
+//!         decode(&[&character], 0..positions.len(), usize::MAX, &mut positions)?;
+//!         let _into_the_world = character.placement();
+//!     }
+//! }
+//! client.close();
+//! # Ok(())
+//! # }
+//! # #[cfg(not(feature = "driver"))]
+//! # fn main() {}
+//! ```
+//!
 //! Map: `client` connects (feature `driver`); [`loader`] makes versions of chunks; [`version`] a version assembled, [`cache`] decoded
 //! regions, [`shared`] how both reach the frame loop; [`character`] the face, [`blend`] and
 //! [`placement`] under it; [`prefetch`] what is needed next; [`telemetry`] and [`stats`] what was

@@ -175,3 +175,47 @@ pub fn refusal(config: ClientConfig, timeout: Duration) -> anyhow::Result<String
         Err(error) => Err(anyhow!("the client was neither let in nor refused: {error}")),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use protocol::frame::FrameDecoder;
+
+    use super::*;
+
+    #[test]
+    fn noise_arrives_and_is_the_same_for_the_same_seed() {
+        let listen = || {
+            let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+            socket.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+            throw_noise(socket.local_addr().unwrap(), 3, 7).unwrap();
+            let mut bytes = [0; 2000];
+            (0..3).map(|_| socket.recv(&mut bytes).map(|n| bytes[..n].to_vec()).unwrap()).collect()
+        };
+        let (first, second): (Vec<Vec<u8>>, Vec<Vec<u8>>) = (listen(), listen());
+        assert_eq!(first, second);
+        assert!(first[0].len() > 5 && first[0][0] & 0xc0 == 0xc0, "a long QUIC header");
+    }
+
+    #[test]
+    fn every_fault_is_one() {
+        for fault in BrokenControl::ALL {
+            let mut frames = FrameDecoder::new(limits::MESSAGE_BYTES_MAX);
+            frames.push(&fault.bytes(Some("token")));
+            let first = frames.poll();
+            match fault {
+                BrokenControl::Oversized | BrokenControl::OverLimit => assert!(first.is_err()),
+                BrokenControl::Truncated => assert_eq!(first, Ok(None)),
+                BrokenControl::Garbage => {
+                    assert!(ClientMessage::decode(&first.unwrap().unwrap()).is_err());
+                }
+                BrokenControl::NoHello | BrokenControl::OtherProtocol => {
+                    let message = ClientMessage::decode(&first.unwrap().unwrap()).unwrap();
+                    let greets =
+                        matches!(message, ClientMessage::Hello(h) if h.protocol == PROTOCOL);
+                    assert!(!greets);
+                }
+                BrokenControl::TwoHellos => assert_eq!(first, frames.poll()),
+            }
+        }
+    }
+}

@@ -271,3 +271,21 @@ fn tell(client: &Client, report: &Mutex<Report>) {
     report.connected = status.connected;
     report.error = status.error;
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn players_without_a_server_say_so_and_stop() {
+        let config = PlayersConfig::new(ClientConfig::new("nowhere"));
+        let players = Players::start(2, &config).unwrap();
+        std::thread::sleep(PATIENCE * 2);
+        let began = Instant::now();
+        let totals = players.stop();
+        assert!(began.elapsed() < Duration::from_secs(3), "{:?}", began.elapsed());
+        assert_eq!((totals.players, totals.connected, totals.frames_played), (2, 0, 0));
+        assert_eq!(totals.errors.len(), 2, "{totals:?}");
+        assert!(totals.errors[1].contains("player 1") && totals.errors[1].contains("host:port"));
+    }
+}
