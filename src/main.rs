@@ -1,2 +1,51 @@
-//! placeholder
-fn main() {}
+//! `toile`: one binary for everything. This file parses and dispatches; each command has a module.
+
+mod args;
+mod explore;
+mod format;
+mod inspect;
+mod live;
+mod place;
+mod play;
+mod record;
+mod scene;
+mod serve;
+mod store;
+mod up;
+
+use std::process::ExitCode;
+
+use args::{Arguments, Command};
+use clap::Parser;
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    start_log(arguments.verbose);
+    let done = match arguments.command {
+        Command::Up(a) => up::run(a),
+        Command::Explore(a) => explore::run(a),
+        Command::Serve(a) => serve::run(a),
+        Command::Play(a) => play::run(a),
+        Command::Inspect(a) => inspect::run(a),
+        Command::Scene(a) => scene::run(a),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Logs go to stderr, warnings and errors only unless asked; `RUST_LOG` overrides.
+fn start_log(verbose: u8) {
+    let level = match verbose {
+        0 => "warn",
+        1 => "info",
+        _ => "debug",
+    };
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(level));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+}

@@ -73,6 +73,7 @@ mod tiny;
 pub use character::{Character, StepOutcome, decode};
 #[cfg(feature = "driver")]
 pub use client::{Client, ClientConfig, ClientError, Status};
+pub use cloth::Rigid;
 pub use loader::Memory;
 pub use scene::Scene;
 pub use stats::{Histogram, PlayStats};

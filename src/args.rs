@@ -1,0 +1,231 @@
+//! What the user typed.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, Parser, Subcommand};
+
+/// Near-exhaustive precomputed cloth: explore, publish, stream, play.
+#[derive(Debug, Parser)]
+#[command(name = "toile", version, about, max_term_width = 100)]
+pub struct Arguments {
+    /// More log on stderr: -v for info, -vv for debug.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub verbose: u8,
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// The commands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Explore, serve and play, all in one process over loopback QUIC.
+    Up(Up),
+    /// Grow the secondary graph of a scene and publish its versions to a store.
+    Explore(Explore),
+    /// Serve a store to players over QUIC, and to browsers and probes over HTTP.
+    Serve(Serve),
+    /// Walk through a served world without a window, and measure it.
+    Play(Play),
+    /// Verify a store and say what is in it.
+    Inspect(Inspect),
+    /// Check a scene, draw it, or compute its motion graph.
+    Scene(Scene),
+}
+
+/// `toile up`.
+#[derive(Debug, Args)]
+pub struct Up {
+    /// Built-in scene (`robe`, `dress`) or a scene file.
+    #[arg(long, default_value = "robe")]
+    pub scene: String,
+    /// Object store: a folder or a URL [default: store/SCENE].
+    #[arg(long, value_name = "URL|DIR")]
+    pub store: Option<String>,
+    /// Working data of the explorer [default: beside a local store].
+    #[arg(long, value_name = "DIR")]
+    pub work: Option<PathBuf>,
+    /// Simulated players.
+    #[arg(long, default_value_t = 3)]
+    pub players: u32,
+    /// Stop after this long, e.g. 60s, 5m [default: until Ctrl-C].
+    #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+    pub time: Option<Duration>,
+    /// Simulation threads [default: all cores].
+    #[arg(long)]
+    pub workers: Option<usize>,
+    /// QUIC address.
+    #[arg(long, default_value = "127.0.0.1:0")]
+    pub listen: SocketAddr,
+    /// HTTP address.
+    #[arg(long, default_value = "127.0.0.1:0")]
+    pub http: SocketAddr,
+    /// One JSON object on the last line of stdout.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `toile explore`.
+#[derive(Debug, Args)]
+pub struct Explore {
+    /// Built-in scene (`robe`, `dress`) or a scene file.
+    #[arg(long)]
+    pub scene: String,
+    /// Object store: a folder or a URL.
+    #[arg(long, value_name = "URL|DIR")]
+    pub store: String,
+    /// Working data [default: beside a local store].
+    #[arg(long, value_name = "DIR")]
+    pub work: Option<PathBuf>,
+    /// Stop when the store holds this many simulated frames.
+    #[arg(long)]
+    pub frames: Option<u64>,
+    /// Stop when no merge is worse than this [mm].
+    #[arg(long, value_name = "MM")]
+    pub error: Option<f32>,
+    /// Stop after this long, e.g. 60s, 5m.
+    #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+    pub time: Option<Duration>,
+    /// Simulation threads [default: all cores].
+    #[arg(long)]
+    pub workers: Option<usize>,
+    /// The paper's plain algorithm: no early stop, no re-merging.
+    #[arg(long)]
+    pub paper: bool,
+    /// One JSON object on the last line of stdout.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `toile serve`.
+#[derive(Debug, Args)]
+pub struct Serve {
+    /// Object store: a folder or a URL.
+    #[arg(long, value_name = "URL|DIR")]
+    pub store: String,
+    /// QUIC address.
+    #[arg(long, default_value = "127.0.0.1:4433")]
+    pub listen: SocketAddr,
+    /// HTTP address.
+    #[arg(long, default_value = "127.0.0.1:8080")]
+    pub http: SocketAddr,
+    /// Token that players must show [default: none needed].
+    #[arg(long, env = "TOILE_TOKEN", hide_env_values = true)]
+    pub token: Option<String>,
+    /// Where the server's certificate is kept [default: beside a local store].
+    #[arg(long, value_name = "DIR")]
+    pub identity: Option<PathBuf>,
+}
+
+/// `toile play`.
+#[derive(Debug, Args)]
+pub struct Play {
+    /// The server's QUIC address.
+    #[arg(long)]
+    pub connect: SocketAddr,
+    /// SHA-256 of the server's certificate, in hexadecimal.
+    #[arg(long)]
+    pub fingerprint: Option<String>,
+    /// Token that the server asks for.
+    #[arg(long, env = "TOILE_TOKEN", hide_env_values = true)]
+    pub token: Option<String>,
+    /// random:SEED, clip:A,B,... or edges:FILE.
+    #[arg(long, default_value = "random:1")]
+    pub walk: String,
+    /// Frames to play.
+    #[arg(long, default_value_t = 300)]
+    pub frames: u64,
+    /// At the scene's rate instead of as fast as possible.
+    #[arg(long)]
+    pub realtime: bool,
+    /// Write body and cloth as an animated glTF file.
+    #[arg(long, value_name = "FILE.glb")]
+    pub export: Option<PathBuf>,
+    /// Write a contact sheet.
+    #[arg(long, value_name = "FILE.png")]
+    pub picture: Option<PathBuf>,
+    /// One JSON object on the last line of stdout.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `toile inspect`.
+#[derive(Debug, Args)]
+pub struct Inspect {
+    /// Object store: a folder or a URL.
+    #[arg(long, value_name = "URL|DIR")]
+    pub store: String,
+    /// One JSON object on the last line of stdout.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `toile scene`.
+#[derive(Debug, Args)]
+pub struct Scene {
+    /// What to do with it.
+    #[command(subcommand)]
+    pub command: SceneCommand,
+}
+
+/// The commands of `toile scene`.
+#[derive(Debug, Subcommand)]
+pub enum SceneCommand {
+    /// Read a scene, say what was read, and refuse what cannot work.
+    Check {
+        /// Built-in scene or a scene file.
+        file: String,
+        /// One JSON object on the last line of stdout.
+        #[arg(long)]
+        json: bool,
+    },
+    /// Compute a motion graph from the scene's clips.
+    Graph {
+        /// Built-in scene or a scene file.
+        file: String,
+        /// Median time to reach a given clip [s]; smaller is denser [default: as the file says].
+        #[arg(long, value_name = "SECONDS")]
+        density: Option<f32>,
+        /// Where to write it (the format of `motion_graph.file`).
+        #[arg(long, value_name = "FILE.json")]
+        out: PathBuf,
+    },
+    /// Draw the garment in the rest pose and the clips' poses as a contact sheet.
+    Picture {
+        /// Built-in scene or a scene file.
+        file: String,
+        /// Where to write it.
+        #[arg(long, value_name = "FILE.png")]
+        out: PathBuf,
+    },
+}
+
+fn duration(text: &str) -> Result<Duration, String> {
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let seconds = match &text[digits.len()..] {
+        "ms" => 1e-3,
+        "s" | "" => 1.0,
+        "m" | "min" => 60.0,
+        "h" => 3600.0,
+        unit => return Err(format!("unknown unit `{unit}`: use ms, s, m or h, as in 60s")),
+    };
+    let value: f64 = digits.parse().map_err(|_| "expected a time such as 60s or 5m".to_string())?;
+    Duration::try_from_secs_f64(value * seconds).map_err(|e| e.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_read_with_their_units() {
+        assert_eq!(duration("60s"), Ok(Duration::from_secs(60)));
+        assert_eq!(duration("1.5m"), Ok(Duration::from_secs(90)));
+        assert_eq!(duration("250ms"), Ok(Duration::from_millis(250)));
+        for wrong in ["", "s", "-1s", "5 parsecs", "1e400s", "NaN"] {
+            assert!(duration(wrong).is_err(), "{wrong}");
+        }
+    }
+}

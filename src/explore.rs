@@ -1,0 +1,186 @@
+//! `toile explore`.
+
+use std::io::IsTerminal;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, ensure};
+use explorer::cloth_simulator::ClothSimulatorFactory;
+use explorer::explore::{End, ExploreOptions, Place, Progress, Summary, explore};
+use explorer::scene::Scene;
+
+use crate::live::Live;
+use crate::store::Opened;
+use crate::{args, format, place, scene, store};
+
+/// Explores until told otherwise.
+pub fn run(a: args::Explore) -> Result<()> {
+    if let Some(error) = a.error {
+        ensure!(error.is_finite() && error >= 0.0, "--error {error}: millimetres, at least 0");
+    }
+    let scene = scene::load(&a.scene)?;
+    let opened = store::create_store(&a.store)?;
+    let work = place::work(&opened, a.work)?;
+    let stop = Stop::on_signals()?.after(a.time);
+    let options = ExploreOptions {
+        workers: place::workers(a.workers)?,
+        frames: a.frames,
+        error_m: a.error.map(|mm| mm / 1000.0),
+        paper: a.paper,
+        best_prefix_at_end: true,
+        should_stop: stop.asked(),
+    };
+    let mut live = Live::new(a.frames);
+    let mut version = None;
+    let summary = explore_blocking(&scene, &opened, work, &options, &mut |progress| {
+        if let Some(failure) = &progress.failure {
+            live.note(&format!("a job was given up: {failure}"));
+        }
+        if progress.version != version {
+            version = progress.version;
+            live.note(&line(progress));
+        }
+        live.tell(progress.simulated_frames, || line(progress));
+    });
+    live.done();
+    let summary = summary?;
+    if a.json {
+        return format::print_json(&summary);
+    }
+    print(&summary);
+    Ok(())
+}
+
+/// Explores on this thread until it ends.
+pub fn explore_blocking(
+    scene: &Scene,
+    opened: &Opened,
+    work: std::path::PathBuf,
+    options: &ExploreOptions,
+    progress: &mut dyn FnMut(&Progress),
+) -> Result<Summary> {
+    std::fs::create_dir_all(&work).with_context(|| format!("making {}", work.display()))?;
+    if let Some(folder) = &opened.folder {
+        explorer::pack::collect_leftovers(folder)
+            .with_context(|| format!("clearing half-written files in {}", folder.display()))?;
+    }
+    let key = explorer::pack::load_or_make_key(&work.join("publisher.key"))?;
+    let simulators = ClothSimulatorFactory::new(scene).context("setting up the simulation")?;
+    let place = Place { store: Arc::clone(&opened.store), key, work };
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    Ok(runtime.block_on(explore(scene, &simulators, &place, options, progress))?)
+}
+
+/// One line about an exploration.
+pub fn line(p: &Progress) -> String {
+    let version = p.version.map_or("no version yet".into(), |v| format!("version {v}"));
+    if p.best_worst_error_m.is_none() {
+        return format!("initial pass: {} of {} frames", p.simulated_frames, p.initial_frames);
+    }
+    format!(
+        "{} frames, {} states, worst merge {:.1} mm, mean {:.1} mm, {version}",
+        p.simulated_frames,
+        p.states,
+        format::mm(p.worst_error_m),
+        format::mm(p.mean_error_m),
+    )
+}
+
+fn print(s: &Summary) {
+    println!(
+        "{} states in {} trajectories over {} poses and {} edges; {} merges",
+        s.states, s.trajectories, s.poses, s.edges, s.merges
+    );
+    println!(
+        "worst merge {:.1} mm (best prefix {:.1} mm), mean {:.1} mm; version {}",
+        s.worst_error_mm, s.best_worst_error_mm, s.mean_error_mm, s.version
+    );
+    println!(
+        "{} frames simulated in {:.1} CPU s, {:.4} s a frame",
+        s.simulated_frames,
+        s.simulate_cpu_s,
+        s.simulate_cpu_s / (s.simulated_frames.max(1)) as f64
+    );
+    let q = &s.quality;
+    println!(
+        "simulated cloth: largest strain {:.1} %; {} of {} vertex-frames deeper than 5 mm \
+         ({} more pinched); deepest {:.1} mm",
+        100.0 * q.stretch_max,
+        q.deep_vertex_frames,
+        q.vertex_frames,
+        q.pinched_vertex_frames,
+        format::mm(q.depth_max_m)
+    );
+    match s.end {
+        End::Stopped => println!("stopped; the same command goes on from here"),
+        End::Frames | End::Error => {}
+        End::Exhausted => println!("no dead end is left to expand"),
+    }
+}
+
+/// When to stop: Ctrl-C or SIGTERM, or a time limit. A second Ctrl-C ends the process at once.
+#[derive(Clone)]
+pub struct Stop {
+    flag: Arc<AtomicBool>,
+    deadline: Option<Instant>,
+}
+
+impl Stop {
+    /// Listens for signals on a thread of its own.
+    pub fn on_signals() -> Result<Self> {
+        let flag = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&flag);
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let listen = move || {
+            runtime.block_on(async {
+                wait_for_signal().await;
+                asked.store(true, Ordering::Relaxed);
+                if std::io::stderr().is_terminal() {
+                    eprintln!("stopping; once more to stop at once");
+                }
+                wait_for_signal().await;
+                std::process::exit(130);
+            });
+        };
+        std::thread::Builder::new().name("signals".into()).spawn(listen)?;
+        Ok(Self { flag, deadline: None })
+    }
+
+    /// Also stops this long from now.
+    pub fn after(mut self, time: Option<Duration>) -> Self {
+        self.deadline = time.map(|time| Instant::now() + time);
+        self
+    }
+
+    /// Whether it is time.
+    pub fn is_asked(&self) -> bool {
+        self.flag.load(Ordering::Relaxed) || self.deadline.is_some_and(|d| Instant::now() >= d)
+    }
+
+    /// Stops without a signal.
+    pub fn stop(&self) {
+        self.flag.store(true, Ordering::Relaxed);
+    }
+
+    /// The same question, for whoever asks often.
+    pub fn asked(&self) -> Arc<dyn Fn() -> bool + Send + Sync> {
+        let stop = self.clone();
+        Arc::new(move || stop.is_asked())
+    }
+}
+
+async fn wait_for_signal() {
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
+            tokio::select! {
+                _ = tokio::signal::ctrl_c() => {}
+                _ = terminate.recv() => {}
+            }
+            return;
+        }
+    }
+    let _ = tokio::signal::ctrl_c().await;
+}

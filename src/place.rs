@@ -1,0 +1,39 @@
+//! Where things lie beside a store.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+
+use crate::store::Opened;
+
+/// The folder beside a local store with this ending; a remote store has none.
+fn beside(store: &Opened, ending: &str) -> Option<PathBuf> {
+    let root = store.folder.as_ref()?;
+    let mut name = root.file_name()?.to_os_string();
+    name.push(ending);
+    Some(root.with_file_name(name))
+}
+
+/// The explorer's work folder: as asked, or `STORE.work`.
+pub fn work(store: &Opened, asked: Option<PathBuf>) -> Result<PathBuf> {
+    asked
+        .or_else(|| beside(store, ".work"))
+        .context("a remote store needs --work DIR: working data is never published")
+}
+
+/// Where the server keeps its certificate: as asked, or `STORE.server`.
+pub fn identity(store: &Opened, asked: Option<PathBuf>) -> Result<PathBuf> {
+    asked
+        .or_else(|| beside(store, ".server"))
+        .context("a remote store needs --identity DIR for the server's certificate")
+}
+
+/// As many threads as asked, at least one; by default one per core.
+pub fn workers(asked: Option<usize>) -> Result<usize> {
+    match asked {
+        Some(0) => anyhow::bail!("--workers 0: at least one is needed"),
+        Some(n) if n > 1024 => anyhow::bail!("--workers {n}: at most 1024"),
+        Some(n) => Ok(n),
+        None => Ok(std::thread::available_parallelism().map_or(1, usize::from)),
+    }
+}

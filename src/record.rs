@@ -1,0 +1,133 @@
+//! What `toile play` writes for people who look: an animated glTF file, a contact sheet.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+use client_lib::Character;
+use glam::Vec3;
+use picture::glb::{Clip, ClipMesh};
+use picture::{Camera, Layer, Paint, Sheet, View};
+
+/// Pictures of a contact sheet.
+const SHOTS: u64 = 40;
+const SHEET_COLUMNS: u32 = 8;
+const BODY: picture::Rgb = [196, 176, 160];
+const CLOTH: picture::Rgb = [72, 118, 196];
+
+/// Keeps what was shown, as much of it as was asked for.
+pub struct Recorder {
+    export: Option<PathBuf>,
+    picture: Option<PathBuf>,
+    frames: u64,
+    played: u64,
+    body: Vec<Vec<Vec3>>,
+    cloth: Vec<Vec<Vec3>>,
+    sheet: Sheet,
+    joints: Vec<client_lib::Rigid>,
+}
+
+impl Recorder {
+    /// Refuses files that could not be written, before anything is played.
+    pub fn new(export: Option<PathBuf>, picture: Option<PathBuf>, frames: u64) -> Result<Self> {
+        for file in [&export, &picture].into_iter().flatten() {
+            let folder = file.parent().filter(|f| !f.as_os_str().is_empty());
+            let folder = folder.unwrap_or(Path::new("."));
+            ensure!(folder.is_dir(), "{}: there is no folder {}", file.display(), folder.display());
+        }
+        let most = picture::glb::FRAMES_MAX as u64;
+        ensure!(
+            export.is_none() || frames <= most,
+            "--export holds at most {most} frames; ask for fewer with --frames"
+        );
+        let sheet = Sheet::new(SHEET_COLUMNS);
+        let (body, cloth, joints) = (Vec::new(), Vec::new(), Vec::new());
+        Ok(Self { export, picture, frames, played: 0, body, cloth, sheet, joints })
+    }
+
+    /// Takes a frame: the character, and its cloth in the world.
+    pub fn frame(&mut self, character: &Character, cloth: &[Vec3]) -> Result<()> {
+        let number = self.played;
+        self.played += 1;
+        let shots = SHOTS.min(self.frames);
+        let shoot = self.picture.is_some() && (number * shots) % self.frames < shots;
+        if !shoot && self.export.is_none() {
+            return Ok(());
+        }
+        let version = character.version();
+        let pose = character.world_pose();
+        let mut body = Vec::new();
+        if let Some(mesh) = version.scene().body() {
+            mesh.skin(&pose, &mut self.joints, &mut body);
+        }
+        if shoot {
+            let picture = shot(character, &body, cloth, pose.root)?;
+            self.sheet.push(picture, caption(character, number));
+        }
+        if self.export.is_some() {
+            self.body.push(body);
+            self.cloth.push(cloth.to_vec());
+        }
+        Ok(())
+    }
+
+    /// Writes the files.
+    pub fn finish(self, character: &Character) -> Result<()> {
+        if let Some(file) = &self.picture {
+            let title = format!("{}, version {}", "walk", character.version().number());
+            write(file, &self.sheet.titled(title).image()?.png()?)?;
+        }
+        let Some(file) = &self.export else { return Ok(()) };
+        let version = character.version();
+        let mut meshes = Vec::new();
+        if let Some(body) = version.scene().body() {
+            meshes.push(ClipMesh {
+                name: "body",
+                triangles: &body.triangles,
+                frames: &self.body,
+                colour: BODY,
+                two_sided: false,
+            });
+        }
+        meshes.push(ClipMesh {
+            name: &version.mesh().name,
+            triangles: &version.mesh().triangles,
+            frames: &self.cloth,
+            colour: CLOTH,
+            two_sided: true,
+        });
+        let clip = Clip { rate: version.scene().fps(), normals: true, meshes: &meshes };
+        write(file, &picture::glb::glb(&clip)?)
+    }
+}
+
+fn shot(
+    character: &Character,
+    body: &[Vec3],
+    cloth: &[Vec3],
+    hips: Vec3,
+) -> Result<picture::Image> {
+    let version = character.version();
+    let mut layers = Vec::new();
+    if let Some(mesh) = version.scene().body() {
+        let triangles = &mesh.triangles;
+        layers.push(Layer { positions: body, triangles, paint: Paint::BODY });
+    }
+    let triangles = &version.mesh().triangles;
+    layers.push(Layer { positions: cloth, triangles, paint: Paint::CLOTH });
+    // The camera keeps its height while the character is on the ground, so that a jump shows.
+    let target = Vec3::new(hips.x, 0.85_f32.max(hips.y - 0.35), hips.z);
+    let view = View::new(Camera::around(target, 4.4), 300, 380);
+    Ok(picture::render(&view, &layers)?)
+}
+
+fn caption(character: &Character, number: u64) -> String {
+    let scene = character.version().scene();
+    let pose = character.pose();
+    let clip = &scene.clips()[usize::from(scene.clip_of(pose))];
+    let arrow = if scene.is_transition(pose) { "> " } else { "" };
+    format!("{number}: {arrow}{clip} {}", scene.frame_of(pose))
+}
+
+fn write(file: &Path, bytes: &[u8]) -> Result<()> {
+    std::fs::write(file, bytes).with_context(|| format!("writing {}", file.display()))
+}

@@ -1,0 +1,93 @@
+//! `toile scene`: check, compute a motion graph, draw.
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use explorer::import::check::check_scene;
+use explorer::import::compute::Density;
+use explorer::import::{data_dir, load_scene, scene_graph};
+use explorer::scene::Scene;
+use glam::Vec3;
+use picture::{Camera, Layer, Paint, Sheet, View};
+
+use crate::{args, format};
+
+/// Runs `toile scene ...`.
+pub fn run(a: args::Scene) -> Result<()> {
+    match a.command {
+        args::SceneCommand::Check { file, json } => check(&file, json),
+        args::SceneCommand::Graph { file, density, out } => graph(&file, density, &out),
+        args::SceneCommand::Picture { file, out } => {
+            let scene = load(&file)?;
+            std::fs::write(&out, sheet(&scene)?)
+                .with_context(|| format!("writing {}", out.display()))
+        }
+    }
+}
+
+/// Loads a scene by name or file.
+pub fn load(name_or_file: &str) -> Result<Scene> {
+    Ok(load_scene(name_or_file, data_dir().as_deref())?)
+}
+
+/// The garment in the rest pose from four sides, then poses of every clip.
+fn sheet(scene: &Scene) -> Result<Vec<u8>> {
+    let poses_per_clip = 8;
+    let mut sheet = Sheet::new(poses_per_clip).titled(format!("scene {}", scene.name));
+    let (mut joints, mut body) = (Vec::new(), Vec::new());
+    scene.body.skin(&scene.body.skeleton.rest_pose(), &mut joints, &mut body);
+    for (name, yaw) in [("front", 0.0), ("left", 1.57), ("back", 3.14), ("right", 4.71)] {
+        for (what, cloth) in [("body", false), ("garment", true)] {
+            let mut layers = vec![layer(&body, &scene.body.triangles, Paint::BODY)];
+            if cloth {
+                layers.push(layer(
+                    &scene.garment.positions,
+                    &scene.garment.triangles,
+                    Paint::CLOTH,
+                ));
+            }
+            let view = View::new(Camera::framing(&body, 0.75, yaw, 0.1), 210, 280);
+            sheet.push(picture::render(&view, &layers)?, format!("{what} {name}"));
+        }
+    }
+    for (clip, name) in scene.primary.clips().iter().enumerate() {
+        let of_clip: Vec<_> = scene
+            .primary
+            .poses()
+            .iter()
+            .filter(|p| p.clip as usize == clip && !p.transition)
+            .collect();
+        for shot in 0..poses_per_clip as usize {
+            let Some(pose) = of_clip.get(shot * of_clip.len() / poses_per_clip as usize) else {
+                continue;
+            };
+            scene.body.skin(&pose.pose, &mut joints, &mut body);
+            let centre = Vec3::new(pose.pose.root.x, 0.85, pose.pose.root.z);
+            let view = View::new(Camera::around(centre, 4.6), 210, 280);
+            let layers = [layer(&body, &scene.body.triangles, Paint::BODY)];
+            sheet.push(picture::render(&view, &layers)?, format!("{name} {}", pose.frame));
+        }
+    }
+    Ok(sheet.image()?.png()?)
+}
+
+fn layer<'a>(positions: &'a [Vec3], triangles: &'a [[u32; 3]], paint: Paint<'a>) -> Layer<'a> {
+    Layer { positions, triangles, paint }
+}
+
+fn check(file: &str, json: bool) -> Result<()> {
+    let report = check_scene(file, data_dir().as_deref())?;
+    if json {
+        return format::print_json(&report);
+    }
+    print!("{report}");
+    Ok(())
+}
+
+fn graph(file: &str, seconds: Option<f32>, out: &Path) -> Result<()> {
+    let density = seconds.map(Density::Reach);
+    let graph = scene_graph(file, data_dir().as_deref(), density)?;
+    std::fs::write(out, graph.to_json()).with_context(|| format!("writing {}", out.display()))?;
+    println!("{}: {} transitions", out.display(), graph.transitions.len());
+    Ok(())
+}

@@ -1,0 +1,208 @@
+//! `toile up`: explorer, server and players in one process, over real loopback QUIC.
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, anyhow};
+use client_lib::ClientConfig;
+use explorer::explore::{ExploreOptions, Progress, Summary};
+use explorer::scene::Scene;
+use loadtest::{Players, PlayersConfig, Totals};
+use serde::Serialize;
+use server::{Server, ServerConfig};
+
+use crate::explore::{Stop, explore_blocking, line};
+use crate::live::Live;
+use crate::store::Opened;
+use crate::{args, format, place, scene, serve, store};
+
+/// Between two looks at how it goes.
+const POLL: Duration = Duration::from_millis(100);
+
+/// The promised keys.
+#[derive(Debug, Serialize)]
+struct Outcome {
+    states: u64,
+    worst_error_mm: f64,
+    versions: u64,
+    players: usize,
+    frames_played: u64,
+    frames_exact: u64,
+    frames_substituted: u64,
+    frames_missed: u64,
+    shown_error_mm_p99: f64,
+    bytes_sent: u64,
+    versions_applied: Vec<u64>,
+    first_version_s: Option<f64>,
+    decode_us_p50: f64,
+    resident_bytes_max: usize,
+}
+
+/// Runs the whole line until Ctrl-C or the time is over.
+pub fn run(a: args::Up) -> Result<()> {
+    let start = Instant::now();
+    let scene = scene::load(&a.scene)?;
+    let store_place = a.store.clone().unwrap_or_else(|| format!("store/{}", scene.name));
+    let opened = store::create_store(&store_place)?;
+    let work = place::work(&opened, a.work.clone())?;
+    let identity = place::identity(&opened, None).unwrap_or_else(|_| work.join("server"));
+    let stop = Stop::on_signals()?.after(a.time);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .context("starting the server's runtime")?;
+    let config = ServerConfig {
+        http: Some(a.http),
+        ..ServerConfig::new(Arc::clone(&opened.store), a.listen, identity)
+    };
+    let server = runtime.block_on(Server::start(config)).context("starting the server")?;
+    eprintln!("scene {} into {store_place}", scene.name);
+    if !a.json {
+        serve::announce(&server);
+    }
+    let options = ExploreOptions {
+        workers: place::workers(a.workers)?,
+        best_prefix_at_end: false,
+        should_stop: stop.asked(),
+        ..ExploreOptions::default()
+    };
+    let explorer = Explorer::start(scene, opened, work, options)?;
+    let players = players(&server, a.players)?;
+    let watched = watch(&explorer, &server, &players, &stop, start);
+    stop.stop();
+    let totals = players.stop();
+    let explored = explorer.join();
+    let sent = server.stats().bytes_sent;
+    runtime.block_on(server.shutdown());
+    let summary = explored?;
+    let outcome = outcome(&summary, totals, sent, watched.first_version);
+    if a.json {
+        return format::print_json(&outcome);
+    }
+    print(&outcome);
+    Ok(())
+}
+
+/// The explorer on a thread of its own, and what it said last.
+struct Explorer {
+    thread: JoinHandle<Result<Summary>>,
+    progress: Arc<Mutex<Option<Progress>>>,
+}
+
+impl Explorer {
+    fn start(scene: Scene, opened: Opened, work: PathBuf, options: ExploreOptions) -> Result<Self> {
+        let progress = Arc::new(Mutex::new(None));
+        let shared = Arc::clone(&progress);
+        let body = move || {
+            explore_blocking(&scene, &opened, work, &options, &mut |now| {
+                *shared.lock().unwrap_or_else(PoisonError::into_inner) = Some(now.clone());
+            })
+        };
+        let thread = std::thread::Builder::new().name("explorer".into()).spawn(body)?;
+        Ok(Self { thread, progress })
+    }
+
+    fn progress(&self) -> Option<Progress> {
+        self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn join(self) -> Result<Summary> {
+        self.thread.join().map_err(|_| anyhow!("the explorer panicked; its journal is safe"))?
+    }
+}
+
+fn players(server: &Server, count: u32) -> Result<Players> {
+    let client = ClientConfig {
+        fingerprint: Some(server.fingerprint().to_string()),
+        ..ClientConfig::new(server.quic_addr().to_string())
+    };
+    Players::start(count as usize, &PlayersConfig::new(client)).context("starting the players")
+}
+
+struct Watched {
+    first_version: Option<Duration>,
+}
+
+/// Shows how it goes until it is time to stop, or the explorer ends.
+fn watch(
+    explorer: &Explorer,
+    server: &Server,
+    players: &Players,
+    stop: &Stop,
+    start: Instant,
+) -> Watched {
+    let mut live = Live::new(None);
+    let mut watched = Watched { first_version: None };
+    let mut version = 0;
+    while !stop.is_asked() && !explorer.thread.is_finished() {
+        std::thread::sleep(POLL);
+        let stats = server.stats();
+        let progress = explorer.progress();
+        if stats.version > version {
+            version = stats.version;
+            watched.first_version.get_or_insert(start.elapsed());
+            let said = progress.as_ref().map(line).unwrap_or_default();
+            live.note(&format!(
+                "{:6.1} s  version {version}: {said}",
+                start.elapsed().as_secs_f64()
+            ));
+        }
+        live.tell(version, || {
+            let said = progress.as_ref().map_or("draping the garment".into(), line);
+            format!("{said} | {}", players_line(&players.totals(), stats.bytes_sent))
+        });
+    }
+    live.done();
+    watched
+}
+
+fn players_line(t: &Totals, bytes_sent: u64) -> String {
+    format!(
+        "{} players, {} sent; {} exact, {} substituted, {} missed",
+        t.connected,
+        format::bytes(bytes_sent),
+        t.frames_exact,
+        t.frames_substituted,
+        t.frames_missed
+    )
+}
+
+fn outcome(s: &Summary, t: Totals, bytes_sent: u64, first: Option<Duration>) -> Outcome {
+    Outcome {
+        states: s.states,
+        worst_error_mm: s.worst_error_mm,
+        versions: s.version,
+        players: t.players,
+        frames_played: t.frames_played,
+        frames_exact: t.frames_exact,
+        frames_substituted: t.frames_substituted,
+        frames_missed: t.frames_missed,
+        shown_error_mm_p99: t.shown_error_mm_p99,
+        bytes_sent,
+        versions_applied: t.versions_applied,
+        first_version_s: first.map(|d| d.as_secs_f64()),
+        decode_us_p50: t.decode_us_p50,
+        resident_bytes_max: t.resident_bytes_max,
+    }
+}
+
+fn print(o: &Outcome) {
+    println!(
+        "{} states, worst merge {:.1} mm, {} versions",
+        o.states, o.worst_error_mm, o.versions
+    );
+    println!(
+        "{} players: {} frames, {} exact, {} substituted, {} missed; shown error p99 {:.1} mm; {}",
+        o.players,
+        o.frames_played,
+        o.frames_exact,
+        o.frames_substituted,
+        o.frames_missed,
+        o.shown_error_mm_p99,
+        format::bytes(o.bytes_sent)
+    );
+    println!("the same command goes on from here");
+}

@@ -1,0 +1,99 @@
+//! The whole line: explore, publish, serve, play, inspect; and `up`, which does it all.
+
+use std::time::Duration;
+
+use crate::run::{Serving, path, shared_store, toile_error, toile_json};
+
+#[test]
+fn an_explored_store_is_total_and_its_figures_add_up() {
+    let store = shared_store();
+    let inspected = toile_json(&["inspect", "--store", path(store), "--json"]);
+    assert_eq!(inspected["total"], true);
+    for key in ["version", "poses", "states", "regions", "merges", "rank", "basis_bytes"] {
+        assert!(inspected[key].as_u64().unwrap() > 0, "{key}");
+    }
+    assert!(inspected["worst_error_mm"].as_f64().unwrap() > 0.0);
+    assert!(inspected["codec_max_error_mm"].as_f64().unwrap() > 0.0);
+    let raw = inspected["raw_bytes"].as_u64().unwrap();
+    assert!(raw > 5 * inspected["region_bytes"].as_u64().unwrap());
+}
+
+#[test]
+fn a_player_streams_and_plays_what_was_published() {
+    let serving = Serving::start(shared_store(), &[]);
+    let folder = tempfile::tempdir().unwrap();
+    let (glb, png) = (folder.path().join("walk.glb"), folder.path().join("sheet.png"));
+    let played = serving.play(&["--walk", "random:7", "--frames", "300"]);
+    assert_eq!(played["frames"], 300);
+    assert_eq!(played["missed"], 0);
+    assert!(played["exact"].as_u64().unwrap() + played["substituted"].as_u64().unwrap() == 300);
+    assert!(played["resident_bytes"].as_u64().unwrap() < 8 << 20);
+    assert!(played["max_vertex_speed_m_s"].as_f64().unwrap() < 60.0);
+    let walk = ["--walk", "clip:kick,walk", "--frames", "60", "--export", path(&glb)];
+    serving.play(&[&walk[..], &["--picture", path(&png)]].concat());
+    assert_eq!(&std::fs::read(&glb).unwrap()[..4], b"glTF");
+    assert_eq!(&std::fs::read(&png).unwrap()[1..4], b"PNG");
+}
+
+#[test]
+fn a_player_in_real_time_misses_nothing_and_plays_nearly_all_exactly() {
+    let serving = Serving::start(shared_store(), &[]);
+    let played = serving.play(&["--walk", "random:3", "--frames", "150", "--realtime"]);
+    assert_eq!(played["missed"], 0);
+    assert!(played["exact"].as_u64().unwrap() >= 142, "95 %: {played}");
+}
+
+#[test]
+fn walks_that_make_no_sense_are_refused_in_words() {
+    let serving = Serving::start(shared_store(), &[]);
+    for (walk, word) in [
+        ("clip:cartwheel-on-ice", "cartwheel-on-ice"),
+        ("sideways", "sideways"),
+        ("edges:/nowhere/edges.txt", "/nowhere/edges.txt"),
+        ("random:x", "random"),
+    ] {
+        let said = toile_error(&serving.play_arguments(&["--walk", walk, "--frames", "5"]));
+        assert!(said.contains(word), "{walk}: {said}");
+    }
+}
+
+#[test]
+fn http_answers_health_metrics_status_chunks_and_a_page() {
+    let serving = Serving::start(shared_store(), &[]);
+    serving.play(&["--frames", "30"]);
+    assert_eq!(serving.get("/healthz").unwrap().0, 200);
+    let metrics = String::from_utf8(serving.get("/metrics").unwrap().1).unwrap();
+    assert!(metrics.contains("# TYPE toile_"), "{metrics}");
+    let status: serde_json::Value =
+        serde_json::from_slice(&serving.get("/status").unwrap().1).unwrap();
+    assert!(status["version"].as_u64().unwrap() > 0);
+    assert!(String::from_utf8(serving.get("/").unwrap().1).unwrap().contains("<html"));
+    let chunks = shared_store().join("chunks");
+    let folder = std::fs::read_dir(&chunks).unwrap().next().unwrap().unwrap().path();
+    let chunk = std::fs::read_dir(&folder).unwrap().next().unwrap().unwrap().path();
+    let name = chunk.file_name().unwrap().to_str().unwrap();
+    let (status, bytes) = serving.get(&format!("/chunks/{name}")).unwrap();
+    assert_eq!((status, bytes), (200, std::fs::read(&chunk).unwrap()));
+    assert_eq!(serving.get(&format!("/chunks/{}", "0".repeat(64))).unwrap().0, 404);
+    assert!(serving.get("/chunks/../versions").unwrap().0 >= 400);
+}
+
+#[test]
+fn up_explores_serves_and_plays_and_goes_on_where_it_stopped() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = folder.path().join("robe");
+    let up = |time: &str| {
+        toile_json(&["up", "--store", path(&store), "--for", time, "--players", "2", "--json"])
+    };
+    let first = up("45s");
+    assert!(first["versions"].as_u64().unwrap() >= 1, "{first}");
+    assert_eq!(first["players"], 2);
+    assert_eq!(first["frames_missed"], 0);
+    let outcomes = ["frames_exact", "frames_substituted", "frames_missed"];
+    let sum: u64 = outcomes.iter().map(|key| first[*key].as_u64().unwrap()).sum();
+    assert_eq!(first["frames_played"].as_u64().unwrap(), sum);
+    let second = up("10s");
+    assert!(second["states"].as_u64().unwrap() >= first["states"].as_u64().unwrap());
+    assert!(second["frames_played"].as_u64().unwrap() > 0, "plays at once: {second}");
+    std::thread::sleep(Duration::from_millis(10));
+}
