@@ -35,7 +35,10 @@ pub(crate) fn open(
     let inner = runtime.wrap_udp_socket(std::net::UdpSocket::bind(listen)?)?;
     let socket = Arc::new(CountingSocket { inner, stray });
     let watched = Arc::downgrade(&socket);
-    let limits = EndpointConfig::default();
+    let mut limits = EndpointConfig::default();
+    // A peer may clear the fixed bit only where we allow it (RFC 9287). We do not, so that a
+    // datagram without it is known to be stray.
+    limits.grease_quic_bit(false);
     Ok((Endpoint::new_with_abstract_socket(limits, config, socket, runtime)?, watched))
 }
 

@@ -77,8 +77,12 @@ pub fn robe() -> Result<Scene, BuiltinError> {
         garment,
         exploration: ExplorationSettings {
             tolerance_m: 0.015,
-            publish_every_frames: 240,
-            drape_frames: 30,
+            // Short rounds: on two cores a version every few seconds, so that there is
+            // something to watch.
+            depth_frames: 20,
+            round_jobs: 4,
+            publish_every_frames: 60,
+            drape_frames: 20,
             ..ExplorationSettings::default()
         },
     })
