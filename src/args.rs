@@ -82,7 +82,7 @@ pub struct Explore {
     /// Stop when the store holds this many simulated frames.
     #[arg(long)]
     pub frames: Option<u64>,
-    /// Stop when no merge is worse than this [mm].
+    /// Stop when no merge is worse than this (mm).
     #[arg(long, value_name = "MM")]
     pub error: Option<f32>,
     /// Stop after this long, e.g. 60s, 5m.
@@ -185,7 +185,7 @@ pub enum SceneCommand {
     Graph {
         /// Built-in scene or a scene file.
         file: String,
-        /// Median time to reach a given clip [s]; smaller is denser [default: as the file says].
+        /// Median time to reach a given clip (s); smaller is denser [default: as the file says].
         #[arg(long, value_name = "SECONDS")]
         density: Option<f32>,
         /// Where to write it (the format of `motion_graph.file`).

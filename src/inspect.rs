@@ -29,7 +29,7 @@ struct Summary<'a> {
 }
 
 /// Verifies the head of a store and prints what is in it. A table that is not total is an error.
-pub fn run(a: args::Inspect) -> Result<()> {
+pub fn run(a: &args::Inspect) -> Result<()> {
     let opened = store::open_store(&a.store)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let found = runtime

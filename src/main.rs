@@ -22,11 +22,11 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     start_log(arguments.verbose);
     let done = match arguments.command {
-        Command::Up(a) => up::run(a),
+        Command::Up(a) => up::run(&a),
         Command::Explore(a) => explore::run(a),
         Command::Serve(a) => serve::run(a),
-        Command::Play(a) => play::run(a),
-        Command::Inspect(a) => inspect::run(a),
+        Command::Play(a) => play::run(&a),
+        Command::Inspect(a) => inspect::run(&a),
         Command::Scene(a) => scene::run(a),
     };
     match done {

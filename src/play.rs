@@ -37,7 +37,7 @@ struct Summary {
 }
 
 /// Plays a walk and prints what was shown.
-pub fn run(a: args::Play) -> Result<()> {
+pub fn run(a: &args::Play) -> Result<()> {
     let spec = WalkSpec::parse(&a.walk)?;
     let mut recorder = Recorder::new(a.export.clone(), a.picture.clone(), a.frames)?;
     let client = Client::connect(ClientConfig {

@@ -36,7 +36,7 @@ fn sheet(scene: &Scene) -> Result<Vec<u8>> {
     let mut sheet = Sheet::new(poses_per_clip).titled(format!("scene {}", scene.name));
     let (mut joints, mut body) = (Vec::new(), Vec::new());
     scene.body.skin(&scene.body.skeleton.rest_pose(), &mut joints, &mut body);
-    for (name, yaw) in [("front", 0.0), ("left", 1.57), ("back", 3.14), ("right", 4.71)] {
+    for (name, turn) in [("front", 0.0), ("left", 0.25), ("back", 0.5), ("right", 0.75)] {
         for (what, cloth) in [("body", false), ("garment", true)] {
             let mut layers = vec![layer(&body, &scene.body.triangles, Paint::BODY)];
             if cloth {
@@ -46,7 +46,11 @@ fn sheet(scene: &Scene) -> Result<Vec<u8>> {
                     Paint::CLOTH,
                 ));
             }
-            let view = View::new(Camera::framing(&body, 0.75, yaw, 0.1), 210, 280);
+            let view = View::new(
+                Camera::framing(&body, 0.75, turn * std::f32::consts::TAU, 0.1),
+                210,
+                280,
+            );
             sheet.push(picture::render(&view, &layers)?, format!("{what} {name}"));
         }
     }

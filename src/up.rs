@@ -41,7 +41,7 @@ struct Outcome {
 }
 
 /// Runs the whole line until Ctrl-C or the time is over.
-pub fn run(a: args::Up) -> Result<()> {
+pub fn run(a: &args::Up) -> Result<()> {
     let start = Instant::now();
     let scene = scene::load(&a.scene)?;
     let store_place = a.store.clone().unwrap_or_else(|| format!("store/{}", scene.name));

@@ -54,7 +54,7 @@ impl Placement {
     }
 }
 
-/// The turn about +y [rad] nearest to a rotation; 0 where all turns are equally near.
+/// The turn about +y (rad) nearest to a rotation; 0 where all turns are equally near.
 fn twist_about_y(turn: Quat) -> f32 {
     if turn.y.abs() < 1e-6 && turn.w.abs() < 1e-6 { 0.0 } else { 2.0 * turn.y.atan2(turn.w) }
 }

@@ -104,7 +104,7 @@ impl Basis {
         self.columns
     }
 
-    /// Per column the coefficient [m] over the orthonormal column that `C' = 1` stands for.
+    /// Per column the coefficient (m) over the orthonormal column that `C' = 1` stands for.
     pub fn maxima(&self) -> &[f32] {
         &self.maxima
     }
@@ -138,7 +138,7 @@ impl Basis {
         Ok(())
     }
 
-    /// Positions [m] of `rows` (x0, y0, z0, x1, ...) from the first `columns` coefficients, in
+    /// Positions (m) of `rows` (x0, y0, z0, x1, ...) from the first `columns` coefficients, in
     /// fractions of full scale (`C'` of the paper).
     ///
     /// Any prefix of columns is a coarser state; any range of rows gives the same numbers as the

@@ -30,7 +30,7 @@ pub struct ExploreOptions {
     /// Ends once the store's graph has this many simulated frames, the drape apart (checked at
     /// the end of a round, so that a few more may be simulated).
     pub frames: Option<u64>,
-    /// Ends once the best prefix's worst merge error is at most this [m].
+    /// Ends once the best prefix's worst merge error is at most this (m).
     pub error_m: Option<f32>,
     /// As in the paper: neither early stop nor re-merging.
     pub paper: bool,
@@ -68,11 +68,11 @@ pub struct Progress {
     pub states: u64,
     /// Dead ends in the queue.
     pub queued: u64,
-    /// Largest merge error [m].
+    /// Largest merge error (m).
     pub worst_error_m: f32,
-    /// Lowest worst merge error so far [m], once there is a whole graph.
+    /// Lowest worst merge error so far (m), once there is a whole graph.
     pub best_worst_error_m: Option<f32>,
-    /// Mean merge error [m].
+    /// Mean merge error (m).
     pub mean_error_m: f32,
     /// The newest version published from this work folder.
     pub version: Option<VersionNumber>,
@@ -114,11 +114,11 @@ pub struct Summary {
     pub trajectories: u64,
     /// Dead ends, each merged.
     pub merges: u64,
-    /// Largest merge error [mm].
+    /// Largest merge error (mm).
     pub worst_error_mm: f64,
-    /// Lowest worst merge error since the initial pass [mm].
+    /// Lowest worst merge error since the initial pass (mm).
     pub best_worst_error_mm: f64,
-    /// Mean merge error [mm].
+    /// Mean merge error (mm).
     pub mean_error_mm: f64,
     /// Frames simulated, drape apart.
     pub simulated_frames: u64,

@@ -27,7 +27,7 @@ pub struct GridState {
 pub struct OffGrid {
     /// Which vertex.
     pub vertex: usize,
-    /// `position [m]` or `velocity [m/s]`.
+    /// `position (m)` or `velocity (m/s)`.
     pub what: &'static str,
     /// The component's value.
     pub value: f32,
@@ -50,12 +50,12 @@ impl GridState {
         self.positions.len()
     }
 
-    /// Position of a vertex [m].
+    /// Position of a vertex (m).
     pub fn position(&self, vertex: usize) -> Vec3 {
         unround(self.positions[vertex], POSITION_STEP_M)
     }
 
-    /// Velocity of a vertex [m/s].
+    /// Velocity of a vertex (m/s).
     pub fn velocity(&self, vertex: usize) -> Vec3 {
         unround(self.velocities[vertex], VELOCITY_STEP_M_S)
     }

@@ -23,9 +23,9 @@ pub struct PrimaryEdge {
     pub from: PoseId,
     /// Target.
     pub to: PoseId,
-    /// Turn of the target's clip about +y [rad], before the shift.
+    /// Turn of the target's clip about +y (rad), before the shift.
     pub yaw: f32,
-    /// Horizontal shift of the target's clip: x and z [m].
+    /// Horizontal shift of the target's clip: x and z (m).
     pub shift: [f32; 2],
 }
 

@@ -29,7 +29,7 @@ pub struct Scene {
 pub struct Garment {
     /// Unique in the world.
     pub name: String,
-    /// Vertices in the body's rest pose [m], refined to the scene's edge length.
+    /// Vertices in the body's rest pose (m), refined to the scene's edge length.
     pub positions: Vec<Vec3>,
     /// Counter-clockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
@@ -47,9 +47,9 @@ pub use cloth::Material as Fabric;
 pub struct ExplorationSettings {
     /// Seconds by which velocities are scaled in the metric (Kim et al. 2013, section 5.1).
     pub velocity_time_s: f32,
-    /// A trajectory stops once it is this near to a known state [m].
+    /// A trajectory stops once it is this near to a known state (m).
     pub tolerance_m: f32,
-    /// Longest expansion from a dead end [frames].
+    /// Longest expansion from a dead end (frames).
     pub depth_frames: u32,
     /// Jobs of a round, chosen from one snapshot.
     pub round_jobs: u32,

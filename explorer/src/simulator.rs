@@ -42,7 +42,7 @@ pub struct FrameQuality {
     pub deep_vertex_frames: u64,
     /// Of these, deeper than 5 mm and held between two body parts.
     pub pinched_vertex_frames: u64,
-    /// Deepest vertex that is not held between two body parts [m].
+    /// Deepest vertex that is not held between two body parts (m).
     pub depth_max_m: f32,
     /// Largest strain of an edge (0.1: 10 % longer than at rest).
     pub stretch_max: f32,

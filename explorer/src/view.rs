@@ -27,7 +27,7 @@ pub trait GraphView {
     /// Runs in order of creation; together they cover every state ever created, once.
     fn runs(&self) -> &[Run];
 
-    /// Positions of a state in its state frame [m], `3 * vertex_count` numbers: x0, y0, z0, ...
+    /// Positions of a state in its state frame (m), `3 * vertex_count` numbers: x0, y0, z0, ...
     ///
     /// # Errors
     /// Working data could not be read.

@@ -29,7 +29,7 @@
 //! # Map
 //! | module | what |
 //! | --- | --- |
-//! | [`glb`] | a moving clip of meshes as binary glTF, for Blender and others |
+//! | [`mod@glb`] | a moving clip of meshes as binary glTF, for Blender and others |
 //! | [`image`] | an RGB picture: fill, line, text, PNG in and out |
 //! | [`plot`] | line plots, as SVG and as a picture |
 //! | [`raster`] | meshes to a picture: z-buffer, two-sided shading, ground and its shadow |

@@ -26,7 +26,7 @@ pub struct Plot {
     pub title: String,
     /// What runs along, with its unit: "frames".
     pub x_label: String,
-    /// What runs upwards, with its unit: "worst error [mm]".
+    /// What runs upwards, with its unit: "worst error (mm)".
     pub y_label: String,
     /// Whether values upwards are spaced by their logarithm. What is not above zero is left out.
     pub y_log: bool,

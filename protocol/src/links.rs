@@ -29,7 +29,7 @@ pub enum LinkEntry {
         pose: PoseId,
         /// The interior state that it was merged into.
         target: StateId,
-        /// The metric's distance between the two [m].
+        /// The metric's distance between the two (m).
         error_m: f32,
     },
     /// Not part of this version (of an earlier or a later one): who plays it goes on at

@@ -120,13 +120,13 @@ pub struct VersionStats {
     pub merges: u64,
     /// Frames simulated so far, drape apart.
     pub simulated_frames: u64,
-    /// Largest merge error of this version [m].
+    /// Largest merge error of this version (m).
     pub worst_error_m: f32,
-    /// Mean merge error of this version [m].
+    /// Mean merge error of this version (m).
     pub mean_error_m: f32,
-    /// Largest vertex error of any encoded state of this version [m].
+    /// Largest vertex error of any encoded state of this version (m).
     pub codec_max_error_m: f32,
-    /// Root mean square vertex error of the encoded states [m].
+    /// Root mean square vertex error of the encoded states (m).
     pub codec_rms_error_m: f32,
     /// Raw f32 positions of all its states, in bytes.
     pub raw_bytes: u64,

@@ -23,7 +23,7 @@ pub struct RegionEntry {
     pub state_count: u16,
     /// The newest basis generation its coefficients refer to.
     pub generation: GenerationId,
-    /// True maximum vertex error of its states after decoding [m].
+    /// True maximum vertex error of its states after decoding (m).
     pub max_error_m: f32,
     /// Encoded bytes, in the garment's codec.
     #[serde(with = "crate::wire::bytes")]

@@ -43,9 +43,9 @@ pub struct Joint {
     pub name: String,
     /// Parent; `None` for joint 0 only.
     pub parent: Option<u16>,
-    /// Translation in the parent's frame [m].
+    /// Translation in the parent's frame (m).
     pub offset: [f32; 3],
-    /// World position in the bind pose [m].
+    /// World position in the bind pose (m).
     pub rest_translation: [f32; 3],
     /// World rotation in the bind pose: x, y, z, w.
     pub rest_rotation: [f32; 4],
@@ -60,7 +60,7 @@ pub struct Pose {
     pub frame: u32,
     /// Whether this pose belongs to a transition (made, not recorded).
     pub transition: bool,
-    /// World position of the hips in the clip's frame [m].
+    /// World position of the hips in the clip's frame (m).
     pub root: [f32; 3],
     /// Rotation per joint in its parent's frame: x, y, z, w, each times 32,767, rounded.
     pub rotations: Vec<[i16; 4]>,
@@ -80,7 +80,7 @@ pub struct Edge {
     pub shift: [f32; 2],
 }
 
-/// A capsule that rides on a joint, in the joint's frame [m].
+/// A capsule that rides on a joint, in the joint's frame (m).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Capsule {
     /// Joint it rides on.
@@ -96,7 +96,7 @@ pub struct Capsule {
 /// The skinned body in the bind pose.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BodyMesh {
-    /// Vertices [m].
+    /// Vertices (m).
     pub positions: Vec<[f32; 3]>,
     /// Counter-clockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,

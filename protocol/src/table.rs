@@ -82,7 +82,7 @@ pub enum NotTotal {
 pub struct Follow {
     /// The interior state to play next.
     pub state: StateId,
-    /// The dead end that was merged into it and the error of the merge [m]; `None` where `state`
+    /// The dead end that was merged into it and the error of the merge (m); `None` where `state`
     /// itself was simulated next. The dead end's own coefficients start the blend.
     pub via: Option<(StateId, f32)>,
 }
@@ -92,11 +92,11 @@ pub struct Follow {
 pub enum Entry<'a> {
     /// Playable: the state simulated next per out-edge.
     Interior(&'a [StateId]),
-    /// Merged into `target` with an error [m].
+    /// Merged into `target` with an error (m).
     DeadEnd {
         /// Where playing goes on.
         target: StateId,
-        /// Merge error [m].
+        /// Merge error (m).
         error_m: f32,
     },
     /// Not of this version.

@@ -84,11 +84,11 @@ pub struct GarmentStats {
     pub merges: u64,
     /// Frames simulated so far.
     pub simulated_frames: u64,
-    /// Largest merge error [mm].
+    /// Largest merge error (mm).
     pub worst_error_mm: f64,
-    /// Mean merge error [mm].
+    /// Mean merge error (mm).
     pub mean_error_mm: f64,
-    /// Largest vertex error of the encoded states [mm].
+    /// Largest vertex error of the encoded states (mm).
     pub codec_max_error_mm: f64,
 }
 
@@ -99,7 +99,7 @@ pub struct VersionPoint {
     pub version: u64,
     /// States of all garments.
     pub states: u64,
-    /// Largest merge error of any garment [mm].
+    /// Largest merge error of any garment (mm).
     pub worst_error_mm: f64,
 }
 

@@ -68,7 +68,7 @@ pub enum QuantiseError {
     Step(f32),
 }
 
-/// Rounds a rescaled column `B' = B M` [m] to steps of `step_m` metres.
+/// Rounds a rescaled column `B' = B M` (m) to steps of `step_m` metres.
 ///
 /// The error is at most half a step an entry. Cost: one pass, no allocation.
 ///
@@ -260,7 +260,7 @@ impl<'a> Generation<'a> {
         self.step_m
     }
 
-    /// The coefficient [m] over the orthonormal column that `C' = 1` stands for.
+    /// The coefficient (m) over the orthonormal column that `C' = 1` stands for.
     ///
     /// # Panics
     /// `column` must be below `columns`.

@@ -18,6 +18,6 @@ pub use region::{
 
 /// Name of the profile in a manifest.
 pub const PROFILE: &str = "kim2013";
-/// Step to which rescaled columns are rounded [m]: the coarsest without visible artefacts
+/// Step to which rescaled columns are rounded (m): the coarsest without visible artefacts
 /// according to the paper.
 pub const STEP_M: f32 = 300e-6;

@@ -8,16 +8,16 @@ use super::skeleton::{joint, skeleton};
 use super::surface::{Grid, Mesh, directed_edges, surface_nets};
 use super::{BuiltinError, check};
 
-/// Fillet between the cones [m].
+/// Fillet between the cones (m).
 pub(super) const FILLET_M: f32 = 0.025;
-/// Length of the body's edges [m].
+/// Length of the body's edges (m).
 const EDGE_M: f32 = 0.027;
-/// Reach of a joint's hold on the skin beyond its own cones [m].
+/// Reach of a joint's hold on the skin beyond its own cones (m).
 const HOLD_M: f32 = 0.022;
 /// Passes that even out the weights over the skin.
 const WEIGHT_PASSES: usize = 6;
 
-/// Joint, both ends [m], both radii [m].
+/// Joint, both ends (m), both radii (m).
 type Row = (usize, [f32; 3], [f32; 3], f32, f32);
 
 /// Cones of the left half and the middle.

@@ -20,7 +20,7 @@ impl Placed {
         Self(character::cones().into_iter().map(place).collect())
     }
 
-    /// Least distance between the parts of two groups of joints [m], negative where they overlap.
+    /// Least distance between the parts of two groups of joints (m), negative where they overlap.
     /// Exact to a few millimetres: one cone of each pair is sampled at nine balls.
     pub fn gap(&self, one: &[usize], other: &[usize]) -> f32 {
         let of = |group: &[usize], cone: &RoundCone| group.contains(&(cone.joint as usize));

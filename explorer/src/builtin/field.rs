@@ -13,7 +13,7 @@ pub(super) struct RoundCone {
 }
 
 impl RoundCone {
-    /// Distance of `p` from the surface [m], negative inside. The nearest ball on the axis is
+    /// Distance of `p` from the surface (m), negative inside. The nearest ball on the axis is
     /// found in closed form: its parameter is the foot of `p`, moved along by the cone's slope.
     pub fn distance(&self, p: Vec3) -> f32 {
         let axis = self.b - self.a;
@@ -62,7 +62,7 @@ impl Union {
         Self { cones: cones.iter().map(with_ball).collect(), fillet_m }
     }
 
-    /// Distance of `p` [m]; a few millimetres too small inside fillets. A cone whose ball is
+    /// Distance of `p` (m); a few millimetres too small inside fillets. A cone whose ball is
     /// further than any fillet reaches is passed over, which changes nothing but the time.
     pub fn distance(&self, p: Vec3) -> f32 {
         self.cones.iter().fold(f32::MAX, |sum, (cone, middle, reach)| {

@@ -8,15 +8,15 @@ use glam::Mat3;
 
 use super::skeleton::joint;
 
-/// Of the rest pose: how far the arms are from hanging down [rad].
+/// Of the rest pose: how far the arms are from hanging down (rad).
 const REST_LIFT: f32 = std::f32::consts::FRAC_PI_4;
 /// A leg is never stretched beyond this part of its length: the knee would snap.
 const REACH: f32 = 0.995;
-/// From the ball of a foot back to where its heel touches the ground [m].
+/// From the ball of a foot back to where its heel touches the ground (m).
 const HEEL_M: f32 = 0.165;
 
 /// Turns about the axes of a part: `pitch` leans forward, `yaw` turns to the left, `roll` lifts
-/// the left side [rad].
+/// the left side (rad).
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Turn {
     pub pitch: f32,
@@ -32,7 +32,7 @@ impl Turn {
     }
 }
 
-/// An arm, from hanging straight down [rad]: `swing` forward, `lift` outward, `twist` about itself
+/// An arm, from hanging straight down (rad): `swing` forward, `lift` outward, `twist` about itself
 /// (inward), `elbow` bent.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Arm {
@@ -42,8 +42,8 @@ pub(super) struct Arm {
     pub elbow: f32,
 }
 
-/// A foot: where its ball is above the ground [m]; `pitch` lifts the heel, or below zero the
-/// toes [rad].
+/// A foot: where its ball is above the ground (m); `pitch` lifts the heel, or below zero the
+/// toes (rad).
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Foot {
     pub x: f32,
@@ -56,9 +56,9 @@ pub(super) struct Foot {
 /// A pose, to be placed by its carriage: a spot on the ground with a heading. Left is first.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Figure {
-    /// On the ground [m], and its heading [rad]; all else is told in its frame.
+    /// On the ground (m), and its heading (rad); all else is told in its frame.
     pub carriage: Carriage,
-    /// From where the hips are at rest [m].
+    /// From where the hips are at rest (m).
     pub hips: Vec3,
     pub hips_turn: Turn,
     pub spine: Turn,

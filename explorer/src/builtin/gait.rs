@@ -14,7 +14,7 @@ use super::figure::{Carriage, Figure, Foot};
 pub(super) struct Gait {
     /// Seconds of a cycle: one step of each foot.
     pub cycle_s: f32,
-    /// Along the path [m/s].
+    /// Along the path (m/s).
     pub speed: f32,
     /// Of the path [rad/s].
     pub turn: f32,

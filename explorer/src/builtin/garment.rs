@@ -9,19 +9,19 @@ use super::surface::{Grid, Mesh, directed_edges, surface_nets};
 use super::{BuiltinError, check};
 use crate::scene::{Fabric, Garment};
 
-/// Least distance of the shell's field from the body's [m]; triangles cut corners, so that the
+/// Least distance of the shell's field from the body's (m); triangles cut corners, so that the
 /// garment comes a little nearer.
 const EASE_M: f32 = 0.018;
-/// Length of the robe's edges [m]: gives 3,000 to 3,400 vertices.
+/// Length of the robe's edges (m): gives 3,000 to 3,400 vertices.
 const EDGE_M: f32 = 0.030;
-/// Fillet between the parts of the shell [m].
+/// Fillet between the parts of the shell (m).
 const FILLET_M: f32 = 0.06;
-/// Height of the hem [m]: at the calf.
+/// Height of the hem (m): at the calf.
 const HEM_Y_M: f32 = 0.34;
-/// Radius around the crown within which the hood is held to the head [m].
+/// Radius around the crown within which the hood is held to the head (m).
 const PIN_RADIUS_M: f32 = 0.045;
 
-/// Wide parts: ends [m] and radii [m]; all but the hood are mirrored.
+/// Wide parts: ends (m) and radii (m); all but the hood are mirrored.
 const SLEEVE: ([f32; 3], [f32; 3], f32, f32) =
     ([0.150, 1.385, -0.015], [0.600, 0.935, -0.015], 0.074, 0.128);
 const SKIRT: ([f32; 3], [f32; 3], f32, f32) =

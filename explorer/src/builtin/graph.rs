@@ -43,7 +43,7 @@ const TRANSITIONS: [(&str, Range<usize>, &str, Range<usize>); 23] = [
     ("spin", 38..44, "jump", 0..4),
 ];
 
-/// Under the heel, from the ankle, and under the tip of the toes, from their joint [m].
+/// Under the heel, from the ankle, and under the tip of the toes, from their joint (m).
 const HEEL: Vec3 = Vec3::new(0.0, -0.08, -0.03);
 const TIP: Vec3 = Vec3::new(0.0, -0.025, 0.06);
 
@@ -127,7 +127,7 @@ fn unroll(cycle: &Cycle) -> Clip {
 
 /// Fits of one transition that are looked at, best first.
 const CANDIDATES: usize = 64;
-/// Gap between the legs that a transition shall keep [m].
+/// Gap between the legs that a transition shall keep (m).
 const LEGS_GAP_M: f32 = 0.012;
 
 /// The best fit of each transition in which the legs do not cross; the best of all where there is

@@ -59,7 +59,7 @@ pub enum BuiltinError {
 /// The built-in scene: a character of 1.7 m that walks, runs, turns, jumps, kicks and spins in a
 /// hooded robe of about 3,100 vertices.
 ///
-/// Meshes are in the rest pose [m], y up, facing +z. The garment starts from the first frame of
+/// Meshes are in the rest pose (m), y up, facing +z. The garment starts from the first frame of
 /// the walk. Cost: under a second.
 ///
 /// # Errors

@@ -14,7 +14,7 @@ pub(super) struct Target<'a> {
     pub surface: &'a dyn Fn(Vec3) -> f32,
     /// Boundaries lie where one of these is zero as well.
     pub cuts: &'a [&'a dyn Fn(Vec3) -> f32],
-    /// Wanted length of an edge [m].
+    /// Wanted length of an edge (m).
     pub edge_m: f32,
     /// Passes.
     pub passes: usize,

@@ -23,7 +23,7 @@ pub(super) mod joint {
     pub const COUNT: usize = 21;
 }
 
-/// Name without side, parent (of the left side), place in the rest pose [m] (of the left side).
+/// Name without side, parent (of the left side), place in the rest pose (m) (of the left side).
 const JOINTS: [(&str, usize, [f32; 3]); 13] = [
     ("Hips", 0, [0.0, 0.94, 0.0]),
     ("Spine", 0, [0.0, 1.04, 0.0]),

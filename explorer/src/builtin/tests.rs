@@ -9,10 +9,10 @@ use super::surface::Mesh;
 use super::*;
 use crate::primary::PrimaryGraph;
 
-/// Fastest that any joint may move along any edge [m/s]: a hand thrown up in a jump, a foot in a
+/// Fastest that any joint may move along any edge (m/s): a hand thrown up in a jump, a foot in a
 /// kick. Beyond, the motion would have a jump in it.
 const JOINT_SPEED_MAX_M_S: f32 = 11.0;
-/// Largest change of any joint's velocity from one edge to the next [m/s].
+/// Largest change of any joint's velocity from one edge to the next (m/s).
 const JOINT_JERK_MAX_M_S: f32 = 7.0;
 
 fn scene() -> &'static Scene {

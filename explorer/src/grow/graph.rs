@@ -35,7 +35,7 @@ pub enum Kind {
     DeadEnd {
         /// An interior state of the same pose.
         target: StateId,
-        /// The metric's distance between the two [m].
+        /// The metric's distance between the two (m).
         error_m: f32,
     },
 }
@@ -47,7 +47,7 @@ pub struct Merge {
     pub commit: u64,
     /// Into which interior state.
     pub target: StateId,
-    /// At which distance [m].
+    /// At which distance (m).
     pub error_m: f32,
 }
 
@@ -73,7 +73,7 @@ pub struct Moment {
     pub states: u64,
     /// Runs created so far.
     pub runs: usize,
-    /// Largest merge error [m].
+    /// Largest merge error (m).
     pub worst_error_m: f32,
 }
 
@@ -203,12 +203,12 @@ impl Graph {
         self.states.len() as u64 - 1
     }
 
-    /// Largest merge error [m].
+    /// Largest merge error (m).
     pub fn worst_error_m(&self) -> f32 {
         self.queue.worst_m()
     }
 
-    /// Mean merge error [m]; 0 without dead ends.
+    /// Mean merge error (m); 0 without dead ends.
     pub fn mean_error_m(&self) -> f32 {
         let sum: f64 = self.queue.iter().map(|(_, error_m)| f64::from(error_m)).sum();
         (sum / self.queue.len().max(1) as f64) as f32
@@ -236,7 +236,7 @@ impl Graph {
         }
     }
 
-    /// Lowest worst merge error since the initial pass [m]; `None` before its end.
+    /// Lowest worst merge error since the initial pass (m); `None` before its end.
     pub fn best_worst_error_m(&self) -> Option<f32> {
         Some(self.moments[self.best_commit()? as usize].worst_error_m)
     }

@@ -24,9 +24,9 @@ pub const JOB_STATES_MAX: usize = 512;
 pub struct Rules {
     /// How far states are apart.
     pub metric: Metric,
-    /// A trajectory stops this near to a known state [m].
+    /// A trajectory stops this near to a known state (m).
     pub tolerance_m: f32,
-    /// Longest way from the start [frames].
+    /// Longest way from the start (frames).
     pub depth_frames: u32,
     /// As in the paper: neither early stop nor re-merging.
     pub paper: bool,
@@ -65,7 +65,7 @@ pub struct LocalFrame {
     pub parent: Local,
     /// Along which edge.
     pub edge: EdgeId,
-    /// For a dead end of an expansion: the most similar interior state and its distance [m].
+    /// For a dead end of an expansion: the most similar interior state and its distance (m).
     pub merge: Option<(Local, f32)>,
 }
 
@@ -89,7 +89,7 @@ pub enum JobError {
     Simulate {
         /// The edge.
         edge: EdgeId,
-        /// How far the job had come [frames].
+        /// How far the job had come (frames).
         depth: u32,
         /// What the simulator said.
         source: SimulateError,

@@ -17,18 +17,18 @@ pub struct Metric {
 }
 
 impl Metric {
-    /// `velocity_time_s`: how far ahead a difference of velocity counts [s], finite and >= 0.
+    /// `velocity_time_s`: how far ahead a difference of velocity counts (s), finite and >= 0.
     pub fn new(velocity_time_s: f32) -> Self {
         assert!(velocity_time_s.is_finite() && velocity_time_s >= 0.0);
         Self { velocity_time_s: f64::from(velocity_time_s) }
     }
 
-    /// The distance of two states of the same mesh [m].
+    /// The distance of two states of the same mesh (m).
     pub fn distance(&self, a: &GridState, b: &GridState) -> f32 {
         self.distance_within(a, b, f32::INFINITY).expect("no distance is above infinity")
     }
 
-    /// The distance [m] where it is at most `bound_m`, else `None`, as a rule long before all
+    /// The distance (m) where it is at most `bound_m`, else `None`, as a rule long before all
     /// vertices were looked at.
     pub fn distance_within(&self, a: &GridState, b: &GridState, bound_m: f32) -> Option<f32> {
         assert_eq!(a.vertex_count(), b.vertex_count(), "states of different meshes");

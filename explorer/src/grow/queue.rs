@@ -13,7 +13,7 @@ pub struct Queue {
 }
 
 impl Queue {
-    /// Adds a dead end; `error_m` [m] is finite and not negative.
+    /// Adds a dead end; `error_m` (m) is finite and not negative.
     pub fn insert(&mut self, state: StateId, error_m: f32) {
         let added = self.entries.insert(key(state, error_m));
         assert!(added, "state {state} is queued already");
@@ -25,12 +25,12 @@ impl Queue {
         assert!(removed, "state {state} is not queued with that error");
     }
 
-    /// Dead ends with their errors [m], largest first.
+    /// Dead ends with their errors (m), largest first.
     pub fn iter(&self) -> impl Iterator<Item = (StateId, f32)> {
         self.entries.iter().map(|(Reverse(bits), state)| (*state, f32::from_bits(*bits)))
     }
 
-    /// The largest error [m]; 0 for an empty queue.
+    /// The largest error (m); 0 for an empty queue.
     pub fn worst_m(&self) -> f32 {
         self.iter().next().map_or(0.0, |(_, error_m)| error_m)
     }

@@ -62,7 +62,7 @@ pub struct FrameRecord {
     pub parent: StateId,
     /// Along which edge.
     pub edge: EdgeId,
-    /// For a dead end: where it was merged and at which distance [m].
+    /// For a dead end: where it was merged and at which distance (m).
     pub merge: Option<(StateId, f32)>,
 }
 
@@ -73,7 +73,7 @@ pub struct MergeRecord {
     pub state: StateId,
     /// The interior state it was merged into.
     pub target: StateId,
-    /// The metric's distance between the two [m].
+    /// The metric's distance between the two (m).
     pub error_m: f32,
 }
 

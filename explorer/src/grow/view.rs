@@ -20,7 +20,7 @@ pub enum KindAt<'a> {
     Later,
     /// Interior, with the state simulated on each out-edge.
     Interior(&'a [StateId]),
-    /// Merged into a state, at a distance [m].
+    /// Merged into a state, at a distance (m).
     DeadEnd(StateId, f32),
 }
 

@@ -84,11 +84,11 @@ impl JointTrack {
 /// How well two windows fit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fit {
-    /// Turn of the target about +y [rad], before the shift.
+    /// Turn of the target about +y (rad), before the shift.
     pub yaw: f32,
-    /// Shift of the target along x and z [m].
+    /// Shift of the target along x and z (m).
     pub shift: [f32; 2],
-    /// Root mean square of the distances that are left [m].
+    /// Root mean square of the distances that are left (m).
     pub distance_m: f32,
 }
 

@@ -9,7 +9,7 @@ use protocol::limits::{NAME_BYTES_MAX, POSES_MAX};
 use super::character::{CharacterError, Clip, Rig};
 use super::gltf_file::Document;
 
-/// A joint other than the root may move in its parent by this much [m] before it is refused.
+/// A joint other than the root may move in its parent by this much (m) before it is refused.
 const SLIDE_M: f32 = 1e-3;
 /// Rotations of all joints in all frames of all clips: 512 MB.
 const ROTATIONS_MAX: usize = 1 << 25;

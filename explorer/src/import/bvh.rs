@@ -99,7 +99,7 @@ impl Bvh {
         Ok(Self { joints, frame_time_s, frames })
     }
 
-    /// The motion at a time [s] from the first frame on, held after the last.
+    /// The motion at a time (s) from the first frame on, held after the last.
     pub fn sample(&self, time_s: f32) -> BvhFrame {
         let at = (time_s / self.frame_time_s).clamp(0.0, (self.frames.len() - 1) as f32);
         // Frames that are meant to be hit are hit, whatever the frame time was rounded to.
@@ -111,7 +111,7 @@ impl Bvh {
         BvhFrame { root: a.root.lerp(b.root, t), rotations: rotations.collect() }
     }
 
-    /// Length of the motion [s].
+    /// Length of the motion (s).
     pub fn duration_s(&self) -> f32 {
         (self.frames.len() - 1) as f32 * self.frame_time_s
     }

@@ -12,7 +12,7 @@ use protocol::limits::{JOINTS_MAX, NAME_BYTES_MAX, TRIANGLES_MAX, VERTICES_MAX};
 use super::animation;
 use super::gltf_file::{Document, GltfError};
 
-/// Smallest and largest height of a character [m]; outside, the unit is taken to be wrong.
+/// Smallest and largest height of a character (m); outside, the unit is taken to be wrong.
 pub const HEIGHT_M: [f32; 2] = [0.3, 3.0];
 
 /// A run of poses at a fixed rate.

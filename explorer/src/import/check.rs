@@ -14,9 +14,9 @@ use super::motion_graph::GraphReport;
 use super::reach::Reach;
 use super::{Loaded, SceneError};
 
-/// A garment vertex may be this deep inside the body in the rest pose [m].
+/// A garment vertex may be this deep inside the body in the rest pose (m).
 pub const INSIDE_M_MAX: f32 = 1e-3;
-/// How far along a normal it is looked whether the way leads to the body or from it [m].
+/// How far along a normal it is looked whether the way leads to the body or from it (m).
 const NORMAL_STEP_M: f32 = 2e-3;
 
 /// What was read, for people and machines.
@@ -50,7 +50,7 @@ pub struct SceneReport {
     pub body_triangles: usize,
     /// Joints of the skeleton.
     pub joints: usize,
-    /// Height of the body in the rest pose [m].
+    /// Height of the body in the rest pose (m).
     pub body_height_m: f32,
     /// Name of the garment.
     pub garment: String,
@@ -69,9 +69,9 @@ pub struct GarmentFigures {
     pub triangles: usize,
     /// Area [m^2].
     pub area_m2: f32,
-    /// Longest edge [mm].
+    /// Longest edge (mm).
     pub edge_length_max_mm: f32,
-    /// Least distance of a vertex to the body [mm], negative inside.
+    /// Least distance of a vertex to the body (mm), negative inside.
     pub clearance_min_mm: f32,
 }
 

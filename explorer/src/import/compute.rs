@@ -28,15 +28,15 @@ const MARGIN_FRAMES: usize = 15;
 const SAME_CLIP_FRAMES: usize = 20;
 /// Shortest clip that can be left and entered under these rules.
 const CLIP_FRAMES_MIN: usize = 2 * MARGIN_FRAMES;
-/// Beyond this distance no transition is taken for the sake of a shorter way [m].
+/// Beyond this distance no transition is taken for the sake of a shorter way (m).
 const DISTANCE_M_MAX: f32 = 0.25;
 
 /// How many transitions are asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Density {
-    /// Every local minimum of the distance below this [m].
+    /// Every local minimum of the distance below this (m).
     Threshold(f32),
-    /// As few, best first, as bring the median time to reach a given clip to this [s].
+    /// As few, best first, as bring the median time to reach a given clip to this (s).
     Reach(f32),
 }
 

@@ -14,7 +14,7 @@ use super::refine::{TooFine, refine};
 /// A triangle mesh as read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Surface {
-    /// Vertices [m].
+    /// Vertices (m).
     pub positions: Vec<Vec3>,
     /// Counter-clockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
@@ -71,7 +71,7 @@ pub enum GarmentError {
     /// Refinement.
     #[error("edge_length_m = {edge_length_m}: {problem}")]
     Refine {
-        /// As asked for [m].
+        /// As asked for (m).
         edge_length_m: f32,
         /// What is wrong.
         problem: String,

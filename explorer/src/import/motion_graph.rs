@@ -56,7 +56,7 @@ pub struct FileTransition {
     pub to_clip: String,
     /// Its first frame shown.
     pub to_frame: usize,
-    /// How well they fit [m].
+    /// How well they fit (m).
     #[serde(default)]
     pub distance_m: f32,
 }

@@ -12,9 +12,9 @@ use crate::primary::PrimaryGraph;
 /// A walk ends at the first frame of the clip itself (not of a transition into it).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Reach {
-    /// Half of all walks are shorter [s]; infinite where most clips cannot be reached.
+    /// Half of all walks are shorter (s); infinite where most clips cannot be reached.
     pub median_s: f32,
-    /// Nine tenths are shorter [s].
+    /// Nine tenths are shorter (s).
     pub p90_s: f32,
 }
 

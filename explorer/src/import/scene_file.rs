@@ -106,9 +106,9 @@ pub struct CharacterTable {
 pub struct MotionGraphTable {
     /// JSON.
     pub file: Option<String>,
-    /// Take every local minimum of the distance below this [m].
+    /// Take every local minimum of the distance below this (m).
     pub threshold_m: Option<f32>,
-    /// Take as few local minima as bring the median time to reach a clip below this [s].
+    /// Take as few local minima as bring the median time to reach a clip below this (s).
     pub reach_s: Option<f32>,
 }
 
@@ -127,7 +127,7 @@ pub struct GarmentTable {
     pub file: String,
     /// Name in the world.
     pub name: Option<String>,
-    /// Longest edge after refinement [m].
+    /// Longest edge after refinement (m).
     pub edge_length_m: Option<f32>,
     /// What is held to the body.
     #[serde(default)]

@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 
 /// What the file shall be like; tests change one thing at a time.
 pub(super) struct Glb {
-    /// Height of the box [m].
+    /// Height of the box (m).
     pub(super) height_m: f32,
     /// Joint that every vertex is bound to (a place in the skin's list).
     pub(super) bound_to: u8,

@@ -26,7 +26,7 @@ pub struct Transition {
     pub to_clip: usize,
     /// Its first frame, shown with the full offset.
     pub to_frame: usize,
-    /// Distance by which it was found [m] (see [`mod@super::align`]); not used to build it.
+    /// Distance by which it was found (m) (see [`mod@super::align`]); not used to build it.
     pub distance_m: f32,
 }
 

@@ -52,7 +52,7 @@ pub struct StreamingSvd {
 pub struct Columns {
     /// `rows x rank`.
     pub columns: Mat<f64>,
-    /// One per column [m].
+    /// One per column (m).
     pub singular_values: Vec<f64>,
 }
 

@@ -27,7 +27,7 @@ pub struct EncodeSettings {
     /// A region is said to fall outside once its error is this many times that of the first
     /// version.
     pub error_factor: f32,
-    /// ... and above this [m]: below, no one sees it, and the first version may be tiny.
+    /// ... and above this (m): below, no one sees it, and the first version may be tiny.
     pub error_floor_m: f32,
 }
 
@@ -93,7 +93,7 @@ pub enum EncodeError {
 pub struct EncodedRegion {
     /// `kim2013` region.
     pub bytes: Vec<u8>,
-    /// Largest vertex error of its states, decoded as a client decodes them [m]; rounded up.
+    /// Largest vertex error of its states, decoded as a client decodes them (m); rounded up.
     pub max_error_m: f32,
     /// Sum of squared vertex errors over all its states and vertices [m^2].
     pub square_sum_m2: f64,
@@ -162,7 +162,7 @@ impl Encoder {
     /// Encodes 1 to 32 states: least squares against the decoded columns of each generation in
     /// turn, each taking what the ones before left.
     ///
-    /// * `positions`: state after state, the basis' rows each [m].
+    /// * `positions`: state after state, the basis' rows each (m).
     ///
     /// # Errors
     /// Numbers that are not such states, or not finite.
@@ -194,7 +194,7 @@ impl Encoder {
         Ok(EncodedRegion { bytes, max_error_m: round_up(max.sqrt()), square_sum_m2, overflowed })
     }
 
-    /// Positions [m] of all states of a region that this encoder made, as a client decodes them;
+    /// Positions (m) of all states of a region that this encoder made, as a client decodes them;
     /// `out` is resized.
     ///
     /// # Panics

@@ -36,7 +36,7 @@ pub struct GarmentInspection {
     pub regions: usize,
     /// Dead ends, each merged into an interior state.
     pub merges: u64,
-    /// Largest merge error [mm].
+    /// Largest merge error (mm).
     pub worst_error_mm: f32,
     /// Whether every edge of every state leads to a state, as checked just now.
     pub total: bool,
@@ -46,9 +46,9 @@ pub struct GarmentInspection {
     pub rank: usize,
     /// Basis generations.
     pub generations: usize,
-    /// Largest vertex error of any region [mm].
+    /// Largest vertex error of any region (mm).
     pub codec_max_error_mm: f32,
-    /// Root mean square vertex error [mm], as the publisher measured it.
+    /// Root mean square vertex error (mm), as the publisher measured it.
     pub codec_rms_error_mm: f32,
     /// Bytes of all generations.
     pub basis_bytes: u64,
@@ -101,9 +101,9 @@ pub enum InspectError {
     ErrorStated {
         /// Name of the garment.
         garment: String,
-        /// In the manifest [m].
+        /// In the manifest (m).
         stated_m: f32,
-        /// In a region [m].
+        /// In a region (m).
         found_m: f32,
     },
 }

@@ -1,7 +1,7 @@
 //! Turns states into a basis, regions and versions in an object store.
 //!
 //! Map: [`basis`] streaming SVD; [`encode`] regions and their true error; [`publish`] versions;
-//! [`inspect`] what a store holds; [`scene_chunk`] a scene as clients get it; [`store`] reading
+//! [`mod@inspect`] what a store holds; [`scene_chunk`] a scene as clients get it; [`store`] reading
 //! and writing; [`key`] who signs.
 //!
 //! Absent on purpose: who is connected, and any clock: equal views and equal history make equal

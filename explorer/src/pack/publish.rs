@@ -83,7 +83,7 @@ pub struct Publisher {
     scene: Fixed,
     head: Option<Manifest>,
     encoder: Encoder,
-    /// Largest error of the garment's first version [m].
+    /// Largest error of the garment's first version (m).
     first_error_m: Option<f32>,
 }
 
@@ -252,7 +252,7 @@ impl Publisher {
         VersionNumber(self.head.as_ref().map_or(1, |head| head.number.0 + 1))
     }
 
-    /// From which error on a region falls outside the basis [m].
+    /// From which error on a region falls outside the basis (m).
     fn outside_m(&self) -> f32 {
         let settings = &self.settings;
         self.first_error_m.map_or(f32::INFINITY, |first| {

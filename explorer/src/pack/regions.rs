@@ -117,7 +117,7 @@ pub(super) struct Encoding<'a> {
     pub(super) settings: &'a EncodeSettings,
     /// Generations published so far.
     pub(super) generations: usize,
-    /// A region falls outside from this error on [m]; infinite for the first version.
+    /// A region falls outside from this error on (m); infinite for the first version.
     pub(super) outside_m: f32,
 }
 
