@@ -9,21 +9,25 @@ use crate::mesh::Mesh;
 pub(crate) const STRAIN_MAX: f32 = 0.10;
 /// Sweeps stop when no edge is over this.
 const STRAIN_DONE: f32 = 0.115;
-const SWEEPS: u32 = 60;
+const SWEEPS: u32 = 40;
+/// Sweeps without contact after that, at most.
+const LAST_SWEEPS: u32 = 1000;
 
 /// Gauss-Seidel over the edges in their order, each shortened to `STRAIN_MAX` (Provot 1995, with
-/// masses), in turn with the contact planes. Where planes and edges contradict each other, as
-/// between an arm and the chest, the edges have the last word. Returns the sweeps made: 0 in calm
-/// motion.
-pub(crate) fn project(mesh: &Mesh, inverse_masses: &[f32], rows: &[Row], x: &mut [Vec3A]) -> u32 {
+/// masses), in turn with the contact planes. Where planes, held vertices and edges contradict each
+/// other, as between an arm and the chest, the edges have the last word: then every vertex is
+/// `free` to move by its mass. Returns the sweeps made: 0 in calm motion.
+pub(crate) fn project(
+    mesh: &Mesh,
+    inverse_masses: &[f32],
+    free: &[f32],
+    rows: &[Row],
+    x: &mut [Vec3A],
+) -> u32 {
     let edges = || mesh.edges().iter().copied().zip(mesh.rest_lengths().iter().copied());
-    for sweep in 0..2 * SWEEPS {
-        let worst = shorten(edges(), inverse_masses, x);
-        if worst <= 1.0 + STRAIN_DONE {
+    for sweep in 0..SWEEPS {
+        if shorten(edges(), inverse_masses, x) <= 1.0 + STRAIN_DONE {
             return sweep;
-        }
-        if sweep >= SWEEPS {
-            continue;
         }
         for (x, row) in x.iter_mut().zip(rows) {
             if row.kind == Kind::Plane {
@@ -31,7 +35,12 @@ pub(crate) fn project(mesh: &Mesh, inverse_masses: &[f32], rows: &[Row], x: &mut
             }
         }
     }
-    2 * SWEEPS
+    for sweep in 0..LAST_SWEEPS {
+        if shorten(edges(), free, x) <= 1.0 + STRAIN_DONE {
+            return SWEEPS + sweep;
+        }
+    }
+    SWEEPS + LAST_SWEEPS
 }
 
 /// Shortens edges between held vertices where the skin that leads them stretches too far.

@@ -30,8 +30,9 @@ const HELD_SHARE: f32 = 0.02;
 /// No vertex moves faster [m/s].
 pub const SPEED_MAX_M_S: f32 = 40.0;
 
-const FIRST: Stop = Stop { tolerance: 1e-3, iterations: 120 };
-const SECOND: Stop = Stop { tolerance: 1e-3, iterations: 60 };
+/// The first pass only has to find where the second is to be linearised.
+const FIRST: Stop = Stop { tolerance: 2e-2, iterations: 40 };
+const SECOND: Stop = Stop { tolerance: 2e-3, iterations: 80 };
 
 /// What happens during a step.
 #[derive(Debug, Clone, Copy)]
@@ -90,6 +91,7 @@ pub struct Workspace {
     loads: Vec<[f32; 2]>,
     held: Vec<bool>,
     inverse_masses: Vec<f32>,
+    free: Vec<f32>,
     matrix: Matrix,
     scratch: Scratch,
 }
@@ -165,6 +167,7 @@ impl Workspace {
         self.held.resize(count, false);
         self.inverse_masses.clear();
         self.inverse_masses.extend(model.masses.iter().map(|m| 1.0 / m));
+        self.free.clone_from(&self.inverse_masses);
         self.reference.clear();
         self.reference.extend(model.masses.iter().map(|m| Vec3A::Y * (9.81 * m)));
         for a in &model.attachments {
@@ -380,7 +383,8 @@ impl Workspace {
         for (i, end) in ends.iter().enumerate() {
             self.loads[i] = [self.rows[i].load(*end), self.ground[i].load(*end)];
         }
-        let sweeps = limit::project(&model.mesh, &self.inverse_masses, &self.rows, ends);
+        let sweeps =
+            limit::project(&model.mesh, &self.inverse_masses, &self.free, &self.rows, ends);
         for (i, end) in ends.iter().copied().enumerate() {
             let mut way = if sweeps > 0 { end - self.x[i] } else { self.dx[i] };
             if !self.held[i] {
