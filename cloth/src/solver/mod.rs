@@ -9,6 +9,7 @@ pub(crate) mod contact;
 pub(crate) mod limit;
 pub(crate) mod matrix;
 pub(crate) mod membrane;
+pub(crate) mod recover;
 
 use glam::{Mat3A, Vec3, Vec3A};
 
@@ -18,6 +19,7 @@ use crate::rigid::Rigid;
 use crate::surface::Posed;
 use contact::{Friction, Kind, Near, Row};
 use matrix::{Given, Matrix, Scratch, Stop};
+use recover::Recovery;
 
 /// Longest substep [s].
 pub const SUBSTEP_S_MAX: f32 = 1.0 / 120.0;
@@ -92,6 +94,7 @@ pub struct Workspace {
     held: Vec<bool>,
     inverse_masses: Vec<f32>,
     free: Vec<f32>,
+    recovery: Recovery,
     matrix: Matrix,
     scratch: Scratch,
 }
@@ -116,6 +119,7 @@ pub fn step(
     let dt = span.seconds / substeps as f32;
     let body_way = way / substeps as f32;
     ws.find_all(model, dt, body_way);
+    ws.recovery.mark(model, &ws.near, &ws.held);
     let mut effort = Effort { substeps, ..Effort::default() };
     for substep in 0..substeps {
         if let Some((from, to)) = span.motion {
@@ -248,6 +252,12 @@ impl Workspace {
                 let near = &self.near[i];
                 row = near.carried(&c.surface, &self.from, &self.to);
                 row = row.keep(offset, near.distance, dt);
+                if self.recovery.led[i] {
+                    let home = &model.homes[i];
+                    let from = home.place(&c.surface, &self.from).into();
+                    let to = home.place(&c.surface, &self.to).into();
+                    row = Row::home(self.x[i], from, to, dt);
+                }
             }
             self.rows[i] = if meets(&row, ahead) { row } else { Row::default() };
             self.ground[i] = ground_row(model, ahead);
@@ -262,6 +272,9 @@ impl Workspace {
             self.loads[i] = [self.rows[i].load(at), self.ground[i].load(at)];
             self.ground[i] = ground_row(model, at);
             let Some(c) = &model.body else { continue };
+            if self.recovery.led[i] {
+                continue;
+            }
             let reach = contact::reach(offset, self.dx[i].length(), body_way);
             let start = if self.near[i].found { self.near[i].distance } else { offset };
             let inside = (-start).max(0.0);
