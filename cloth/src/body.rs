@@ -14,7 +14,7 @@ pub struct Skeleton {
     pub names: Vec<String>,
     /// Parent of each joint; `None` for joint 0 only.
     pub parents: Vec<Option<u16>>,
-    /// Translation of each joint in its parent's frame [m]. Joint 0: in the rest pose.
+    /// Translation of each joint in its parent's frame (m). Joint 0: in the rest pose.
     pub offsets: Vec<Vec3>,
     /// World transform of each joint in the rest pose in which the body was bound.
     pub rest: Vec<Rigid>,
@@ -23,7 +23,7 @@ pub struct Skeleton {
 /// One pose: the root's place in the world and a rotation per joint.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Pose {
-    /// World position of joint 0 [m].
+    /// World position of joint 0 (m).
     pub root: Vec3,
     /// Rotation of each joint in its parent's frame (joint 0: in the world), unit quaternions.
     pub rotations: Vec<Quat>,
@@ -111,7 +111,7 @@ impl Skeleton {
 pub struct Body {
     /// The joints that move it.
     pub skeleton: Skeleton,
-    /// Vertices in the rest pose [m].
+    /// Vertices in the rest pose (m).
     pub rest_positions: Vec<Vec3>,
     /// Counter-clockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
@@ -122,7 +122,7 @@ pub struct Body {
 }
 
 impl Body {
-    /// Skinned vertices [m] in the world, into `out` (resized). `scratch` keeps the joints'
+    /// Skinned vertices (m) in the world, into `out` (resized). `scratch` keeps the joints'
     /// transforms, so that a warm call allocates nothing.
     pub fn skin(&self, pose: &Pose, scratch: &mut Vec<Rigid>, out: &mut Vec<Vec3>) {
         self.skeleton.world(pose, scratch);

@@ -41,7 +41,7 @@ pub struct Hit {
     pub triangle: u32,
     /// Where on it.
     pub on: OnTriangle,
-    /// Squared distance [m^2].
+    /// Squared distance (m^2).
     pub distance2: f32,
 }
 

@@ -3,21 +3,21 @@
 /// Physical constants of a cloth, as a scene file gives them. Units: SI.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Material {
-    /// Areal density [kg/m^2].
+    /// Areal density (kg/m^2).
     pub density: f32,
-    /// Membrane stiffness E h [N/m].
+    /// Membrane stiffness E h (N/m).
     pub stretch: f32,
-    /// Shear stiffness G h [N/m].
+    /// Shear stiffness G h (N/m).
     pub shear: f32,
-    /// Bending stiffness per width [N m].
+    /// Bending stiffness per width (N m).
     pub bend: f32,
     /// Coulomb friction against the body.
     pub friction: f32,
     /// Drag coefficient of a sheet normal to the flow (1.28 for a plate).
     pub drag: f32,
-    /// Stiffness-proportional damping time [s].
+    /// Stiffness-proportional damping time (s).
     pub damping_s: f32,
-    /// Distance kept from the body [m].
+    /// Distance kept from the body (m).
     pub offset: f32,
 }
 
@@ -75,7 +75,7 @@ impl Material {
         Ok(())
     }
 
-    /// Isotropic plane-stress constants `(mu, lambda)` [N/m]. Poisson's ratio follows from
+    /// Isotropic plane-stress constants `(mu, lambda)` (N/m). Poisson's ratio follows from
     /// `E = 2 G (1 + nu)` and is held in 0..=0.5, where `stretch` is honoured before `shear`.
     pub fn lame(&self) -> (f32, f32) {
         let nu = (self.stretch / (2.0 * self.shear) - 1.0).clamp(0.0, 0.5);

@@ -5,7 +5,7 @@ use glam::Vec3;
 use crate::mesh::Mesh;
 use crate::surface::{Posed, Surface};
 
-/// How far into a body its surface is looked for [m]: beyond any limb's half thickness.
+/// How far into a body its surface is looked for (m): beyond any limb's half thickness.
 pub const DEPTH_REACH_M: f32 = 0.25;
 
 /// Largest strain of an edge: 0.1 means 10 % longer than at rest; negative if all are shorter.
@@ -35,7 +35,7 @@ pub struct Penetration {
     pub deep: u64,
     /// Vertices deeper than the limit and held between two body parts.
     pub pinched: u64,
-    /// Deepest vertex that is not held between two body parts [m].
+    /// Deepest vertex that is not held between two body parts (m).
     pub depth_max_m: f32,
 }
 
@@ -68,7 +68,7 @@ pub fn penetration(
     sum
 }
 
-/// Signed distance [m] of each point to a closed body, positive outside.
+/// Signed distance (m) of each point to a closed body, positive outside.
 ///
 /// * `positions`, `triangles`: the body's mesh in one pose.
 ///

@@ -4,7 +4,7 @@ use glam::{Vec2, Vec3};
 
 /// Smallest legal triangle: twice its area over its longest edge squared (1:1000 slivers go).
 const SLIVER: f32 = 1e-3;
-/// Smallest legal edge [m].
+/// Smallest legal edge (m).
 const EDGE_M_MIN: f32 = 1e-5;
 
 /// An interior edge and the two vertices opposite to it.
@@ -97,7 +97,7 @@ pub enum MeshError {
 impl Mesh {
     /// Checks the mesh and derives edges, hinges and rest shape. Edges are sorted.
     ///
-    /// * `positions`: rest positions [m].
+    /// * `positions`: rest positions (m).
     /// * `triangles`: counter-clockwise seen from outside.
     ///
     /// # Errors
@@ -168,7 +168,7 @@ impl Mesh {
         self.rest_positions.len()
     }
 
-    /// Rest positions [m].
+    /// Rest positions (m).
     pub fn rest_positions(&self) -> &[Vec3] {
         &self.rest_positions
     }
@@ -183,7 +183,7 @@ impl Mesh {
         &self.edges
     }
 
-    /// Rest length of each edge [m].
+    /// Rest length of each edge (m).
     pub fn rest_lengths(&self) -> &[f32] {
         &self.rest_lengths
     }
@@ -193,7 +193,7 @@ impl Mesh {
         &self.hinges
     }
 
-    /// Rest area of each triangle [m^2].
+    /// Rest area of each triangle (m^2).
     pub fn rest_areas(&self) -> &[f32] {
         &self.rest_areas
     }
@@ -203,7 +203,7 @@ impl Mesh {
         &self.shape_gradients
     }
 
-    /// A third of the area of the triangles around each vertex [m^2].
+    /// A third of the area of the triangles around each vertex (m^2).
     pub fn vertex_areas(&self) -> &[f32] {
         &self.vertex_areas
     }

@@ -14,11 +14,11 @@ use crate::surface::{Posed, Surface};
 /// Gravity, air and ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Environment {
-    /// Acceleration [m/s^2].
+    /// Acceleration (m/s^2).
     pub gravity: Vec3,
-    /// Density of the air [kg/m^3].
+    /// Density of the air (kg/m^3).
     pub air_density: f32,
-    /// Velocity of the air [m/s].
+    /// Velocity of the air (m/s).
     pub wind: Vec3,
     /// Whether there is a ground plane at y = 0.
     pub ground: bool,
@@ -48,7 +48,7 @@ pub struct Attachment {
     pub triangle: u32,
     /// Barycentric coordinates of the closest point in the rest pose.
     pub weights: Vec3,
-    /// From there to the vertex, in the triangle's frame [m].
+    /// From there to the vertex, in the triangle's frame (m).
     pub offset: Vec3,
 }
 
@@ -62,12 +62,12 @@ pub struct Model {
     pub(crate) attachments: Vec<Attachment>,
     /// Where every vertex lies on the body in the rest pose; empty without a body.
     pub(crate) homes: Vec<Attachment>,
-    /// Edges between held vertices, with their rest lengths [m].
+    /// Edges between held vertices, with their rest lengths (m).
     pub(crate) held_edges: Vec<([u32; 2], f32)>,
-    /// Vertex masses [kg].
+    /// Vertex masses (kg).
     pub(crate) masses: Vec<f32>,
     pub(crate) pattern: Pattern,
-    /// Bending energy's Hessian, in the pattern's layout [N/m].
+    /// Bending energy's Hessian, in the pattern's layout (N/m).
     pub(crate) bending: bending::Stiffness,
 }
 
@@ -81,9 +81,9 @@ pub(crate) struct Character {
 /// The whole state of a garment: nothing else is carried from frame to frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct State {
-    /// World positions [m].
+    /// World positions (m).
     pub positions: Vec<Vec3>,
-    /// World velocities [m/s].
+    /// World velocities (m/s).
     pub velocities: Vec<Vec3>,
 }
 
@@ -179,7 +179,7 @@ impl Model {
 }
 
 impl Attachment {
-    /// Where the vertex is held when the body's vertices are at `body` [m].
+    /// Where the vertex is held when the body's vertices are at `body` (m).
     pub(crate) fn place(&self, surface: &Surface, posed: &Posed) -> Vec3 {
         let [a, b, c] = surface.triangle_frame(posed, self.triangle);
         let o = self.offset;

@@ -22,7 +22,7 @@ pub struct Surface {
 /// A surface in one pose.
 #[derive(Debug, Clone, Default)]
 pub struct Posed {
-    /// Its vertices [m].
+    /// Its vertices (m).
     pub positions: Vec<Vec3>,
     fit: Fit,
 }
@@ -34,11 +34,11 @@ pub struct Contact {
     pub triangle: u32,
     /// Barycentric coordinates of the closest point.
     pub weights: Vec3,
-    /// The closest point [m].
+    /// The closest point (m).
     pub point: Vec3,
     /// Unit vector that leads out of the surface there, through the asking point or away from it.
     pub normal: Vec3,
-    /// Signed distance of the asking point [m]: positive outside.
+    /// Signed distance of the asking point (m): positive outside.
     pub distance: f32,
 }
 
@@ -88,14 +88,14 @@ impl Surface {
         posed
     }
 
-    /// The closest point within `reach` [m] of `point`, if any. The side is told by the
+    /// The closest point within `reach` (m) of `point`, if any. The side is told by the
     /// angle-weighted pseudo-normal of the closest feature (Baerentzen & Aanaes 2005).
     pub fn closest(&self, posed: &Posed, point: Vec3, reach: f32) -> Option<Contact> {
         let hit = self.bvh.closest(&posed.fit, point, reach * reach)?;
         Some(self.contact(posed, point, &hit))
     }
 
-    /// Signed distance [m], positive outside; at most `reach` where nothing is that near.
+    /// Signed distance (m), positive outside; at most `reach` where nothing is that near.
     pub fn signed_distance(&self, posed: &Posed, point: Vec3, reach: f32) -> f32 {
         self.closest(posed, point, reach).map_or(reach, |c| c.distance)
     }

@@ -5,7 +5,7 @@ use glam::{Vec3, Vec3A};
 /// A point of a triangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OnTriangle {
-    /// The point [m].
+    /// The point (m).
     pub point: Vec3A,
     /// Its barycentric coordinates.
     pub weights: Vec3,

@@ -16,91 +16,49 @@ use std::time::Instant;
 
 use explorer::cloth_simulator::ClothSimulator;
 use explorer::grid::GridState;
+use explorer::import;
+use explorer::scene::Scene;
 use explorer::simulator::{FrameQuality, Simulator};
-use explorer::{builtin, import};
 use protocol::EdgeId;
 
 fn main() -> ExitCode {
+    match run() {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::FAILURE,
+        Err(e) => {
+            eprintln!("{e}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// What the pass has measured so far.
+#[derive(Default)]
+struct Pass {
+    total: FrameQuality,
+    seconds: Vec<f32>,
+    failed: usize,
+    worst: Vec<(FrameQuality, EdgeId)>,
+}
+
+/// Whether all frames were within bounds.
+fn run() -> Result<bool, String> {
     let mut arguments = std::env::args().skip(1);
     let name = arguments.next().unwrap_or_else(|| "robe".into());
-    let rest: Vec<String> = arguments.collect();
-    let limit = rest.first().and_then(|n| n.parse().ok()).unwrap_or(usize::MAX);
-    let clips: Vec<&str> = rest.iter().skip(1).map(String::as_str).collect();
-    let scene = if name == "robe" {
-        builtin::robe().map_err(|e| e.to_string())
-    } else {
-        import::load_scene(&name, import::data_dir().as_deref()).map_err(|e| e.to_string())
-    };
-    let (scene, mut simulator) = match scene
-        .and_then(|scene| ClothSimulator::new(&scene).map(|s| (scene, s)).map_err(|e| e.0))
-    {
-        Ok(both) => both,
-        Err(e) => {
-            eprintln!("{e}");
-            return ExitCode::FAILURE;
-        }
-    };
-    let wanted = |pose: usize| {
-        let clip = scene.primary.poses()[pose].clip as usize;
-        clips.is_empty() || clips.contains(&scene.primary.clips()[clip].as_str())
-    };
+    let limit = arguments.next().and_then(|n| n.parse().ok()).unwrap_or(usize::MAX);
+    let clips: Vec<String> = arguments.collect();
+    let scene = import::load_scene(&name, import::data_dir().as_deref());
+    let scene = scene.map_err(|e| e.to_string())?;
+    let mut simulator = ClothSimulator::new(&scene).map_err(|e| e.0)?;
     let begun = Instant::now();
-    let draped = match simulator.drape() {
-        Ok(frame) => frame,
-        Err(e) => {
-            eprintln!("{e}");
-            return ExitCode::FAILURE;
-        }
-    };
+    let draped = simulator.drape().map_err(|e| e.0)?;
     println!("drape {:.1} s, {:?}", begun.elapsed().as_secs_f32(), draped.quality);
-    let poses = scene.primary.poses().len();
-    let mut first: Vec<Option<GridState>> = vec![None; poses];
-    let mut seen = vec![false; poses];
-    let mut starts = vec![scene.start.index()];
-    if !clips.is_empty() {
-        starts =
-            (0..poses).filter(|p| wanted(*p) && scene.primary.poses()[*p].frame == 0).collect();
-    }
-    let mut queue = VecDeque::new();
-    for start in starts {
-        seen[start] = true;
-        first[start] = Some(draped.state.clone());
-        queue.push_back(start);
-    }
-    let mut total = FrameQuality::default();
-    let (mut seconds, mut failed) = (Vec::new(), 0);
-    let mut worst: Vec<(FrameQuality, EdgeId)> = Vec::new();
-    while let Some(pose) = queue.pop_front() {
-        let state = first[pose].take().expect("a pose in the queue has a state");
-        for edge in scene.primary.out_edges(protocol::PoseId(pose as u32)) {
-            let to = scene.primary.edge(edge).to.index();
-            if seconds.len() >= limit || !wanted(to) {
-                continue;
-            }
-            let begun = Instant::now();
-            match simulator.step(&state, edge) {
-                Ok(frame) => {
-                    seconds.push(begun.elapsed().as_secs_f32());
-                    total.add(&frame.quality);
-                    worst.push((frame.quality, edge));
-                    if seconds.len() % 100 == 0 {
-                        eprintln!("{} frames, stretch_max {:.3}", seconds.len(), total.stretch_max);
-                    }
-                    if !seen[to] {
-                        seen[to] = true;
-                        first[to] = Some(frame.state);
-                        queue.push_back(to);
-                    }
-                }
-                Err(e) => {
-                    failed += 1;
-                    eprintln!("{e}");
-                }
-            }
-        }
-    }
-    report(&scene, &mut worst, &mut seconds);
-    let deep = total.deep_vertex_frames as f64 / total.vertex_frames.max(1) as f64;
+    let mut pass = Pass::default();
+    walk(&scene, &mut simulator, &draped.state, (limit, &clips), &mut pass);
+    report(&scene, &mut pass.worst, &mut pass.seconds);
+    let (total, failed) = (&pass.total, pass.failed);
+    let share = |part: u64| part as f64 / total.vertex_frames.max(1) as f64;
+    let deep = share(total.deep_vertex_frames);
     println!(
         "frames {} of {} edges, failed {failed}, stretch_max {:.4}, deep {:.5} %, pinched {:.4} %, \
          depth_max {:.1} mm",
@@ -108,19 +66,65 @@ fn main() -> ExitCode {
         scene.primary.edges().len(),
         total.stretch_max,
         deep * 100.0,
-        total.pinched_vertex_frames as f64 / total.vertex_frames.max(1) as f64 * 100.0,
+        share(total.pinched_vertex_frames) * 100.0,
         total.depth_max_m * 1e3
     );
-    let kept = failed == 0 && total.stretch_max <= 0.15 && deep <= 0.001;
-    if kept { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+    Ok(failed == 0 && total.stretch_max <= 0.15 && deep <= 0.001)
+}
+
+/// Simulates every edge that is wanted once, breadth first.
+fn walk(
+    scene: &Scene,
+    simulator: &mut ClothSimulator,
+    draped: &GridState,
+    (limit, clips): (usize, &[String]),
+    pass: &mut Pass,
+) {
+    let poses = scene.primary.poses();
+    let wanted = |pose: usize| {
+        let clip = &scene.primary.clips()[poses[pose].clip as usize];
+        clips.is_empty() || clips.contains(clip)
+    };
+    let mut starts = vec![scene.start.index()];
+    if !clips.is_empty() {
+        starts = (0..poses.len()).filter(|p| wanted(*p) && poses[*p].frame == 0).collect();
+    }
+    let mut first: Vec<Option<GridState>> = vec![None; poses.len()];
+    let mut seen = vec![false; poses.len()];
+    for start in &starts {
+        seen[*start] = true;
+        first[*start] = Some(draped.clone());
+    }
+    let mut queue = VecDeque::from(starts);
+    while let Some(pose) = queue.pop_front() {
+        let Some(state) = first[pose].take() else { continue };
+        for edge in scene.primary.out_edges(protocol::PoseId(pose as u32)) {
+            let to = scene.primary.edge(edge).to.index();
+            if pass.seconds.len() >= limit || !wanted(to) {
+                continue;
+            }
+            let begun = Instant::now();
+            let frame = match simulator.step(&state, edge) {
+                Ok(frame) => frame,
+                Err(e) => {
+                    pass.failed += 1;
+                    eprintln!("{e}");
+                    continue;
+                }
+            };
+            pass.seconds.push(begun.elapsed().as_secs_f32());
+            pass.total.add(&frame.quality);
+            pass.worst.push((frame.quality, edge));
+            if !std::mem::replace(&mut seen[to], true) {
+                first[to] = Some(frame.state);
+                queue.push_back(to);
+            }
+        }
+    }
 }
 
 /// Times, and the frames with the longest edges and the most deep vertices.
-fn report(
-    scene: &explorer::scene::Scene,
-    worst: &mut [(FrameQuality, EdgeId)],
-    seconds: &mut [f32],
-) {
+fn report(scene: &Scene, worst: &mut [(FrameQuality, EdgeId)], seconds: &mut [f32]) {
     let name = |edge: &EdgeId| {
         let pose = scene.primary.pose(scene.primary.edge(*edge).to);
         let made = if pose.transition { " (transition)" } else { "" };

@@ -13,9 +13,9 @@ use crate::grid::GridState;
 use crate::scene::Scene;
 use crate::simulator::{Frame, FrameQuality, SimulateError, Simulator, SimulatorFactory};
 
-/// Vertices deeper in the body are counted [m].
+/// Vertices deeper in the body are counted (m).
 pub const DEEP_M: f32 = 0.005;
-/// A vertex of the garment in the rest pose may be this deep in the body [m]: it is led out.
+/// A vertex of the garment in the rest pose may be this deep in the body (m): it is led out.
 const REST_DEPTH_M: f32 = 0.001;
 
 /// Simulates a scene's garment. Not shared between threads; see [`ClothSimulatorFactory`].

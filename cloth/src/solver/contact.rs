@@ -9,17 +9,17 @@ use glam::{Mat3, Mat3A, Vec3, Vec3A};
 use crate::model::Model;
 use crate::surface::{Posed, Surface};
 
-/// Stiffness of a row [N/m]: a hanging garment's weight sinks in by micrometres.
+/// Stiffness of a row (N/m): a hanging garment's weight sinks in by micrometres.
 const STIFFNESS: f32 = 1e4;
-/// A vertex inside is led out no faster than this [m/s].
+/// A vertex inside is led out no faster than this (m/s).
 const CORRECTION_M_S: f32 = 2.0;
-/// A vertex deeper than this is examined for being held between two body parts [m].
+/// A vertex deeper than this is examined for being held between two body parts (m).
 const PINCH_DEPTH_M: f32 = 0.002;
-/// Stiffness with which a vertex held between two body parts follows them [N/m].
+/// Stiffness with which a vertex held between two body parts follows them (N/m).
 const HELD_STIFFNESS: f32 = 300.0;
-/// Slip at which Coulomb's force is reached [m/s].
+/// Slip at which Coulomb's force is reached (m/s).
 const STICK_M_S: f32 = 1e-3;
-/// Planes are looked for this much further than the motion of a substep demands [m].
+/// Planes are looked for this much further than the motion of a substep demands (m).
 const MARGIN_M: f32 = 0.015;
 
 /// Where a vertex was found near the body.
@@ -32,7 +32,7 @@ pub(crate) struct Near {
     triangle: u32,
     weights: Vec3,
     normal: Vec3,
-    /// Signed distance [m].
+    /// Signed distance (m).
     pub(crate) distance: f32,
 }
 
@@ -41,11 +41,11 @@ pub(crate) struct Near {
 pub(crate) struct Row {
     pub(crate) kind: Kind,
     normal: Vec3A,
-    /// Point of the plane at the substep's end [m].
+    /// Point of the plane at the substep's end (m).
     point: Vec3A,
-    /// Way of that point of the body during the substep [m].
+    /// Way of that point of the body during the substep (m).
     travel: Vec3A,
-    /// Distance to keep [m].
+    /// Distance to keep (m).
     offset: f32,
 }
 
@@ -64,16 +64,16 @@ pub(crate) enum Kind {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Friction {
     pub(crate) coefficient: f32,
-    /// Normal force [N].
+    /// Normal force (N).
     pub(crate) load: f32,
-    /// Way that the vertex would go by its old velocity [m].
+    /// Way that the vertex would go by its old velocity (m).
     pub(crate) way: Vec3A,
-    /// Substep [s].
+    /// Substep (s).
     pub(crate) dt: f32,
 }
 
 impl Near {
-    /// Looks at `point` within `reach` [m].
+    /// Looks at `point` within `reach` (m).
     pub(crate) fn find(model: &Model, posed: &Posed, point: Vec3, reach: f32) -> Self {
         let Some(character) = &model.body else { return Self::default() };
         let surface = &character.surface;
@@ -89,7 +89,7 @@ impl Near {
         }
     }
 
-    /// Whether the vertex is inside one part of the body by more than `depth` [m].
+    /// Whether the vertex is inside one part of the body by more than `depth` (m).
     pub(crate) fn is_deeper_than(&self, depth: f32) -> bool {
         self.found && !self.pinched && self.distance < -depth
     }
@@ -155,12 +155,12 @@ impl Row {
         self
     }
 
-    /// How far in front of its plane's offset a vertex would be at `x` [m].
+    /// How far in front of its plane's offset a vertex would be at `x` (m).
     pub(crate) fn gap(&self, x: Vec3A) -> f32 {
         self.normal.dot(x - self.point) - self.offset
     }
 
-    /// Normal force at `x` [N].
+    /// Normal force at `x` (N).
     pub(crate) fn load(&self, x: Vec3A) -> f32 {
         if self.kind == Kind::Plane { STIFFNESS * (-self.gap(x)).max(0.0) } else { 0.0 }
     }
@@ -202,7 +202,7 @@ impl Row {
     }
 }
 
-/// How far from a vertex planes must be looked for [m], when it and the body move so far.
+/// How far from a vertex planes must be looked for (m), when it and the body move so far.
 pub(crate) fn reach(offset: f32, vertex_way: f32, body_way: f32) -> f32 {
     offset + MARGIN_M + vertex_way + body_way
 }

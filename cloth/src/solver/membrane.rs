@@ -21,7 +21,7 @@ pub(crate) struct Sums<'a> {
     pub(crate) matrix: &'a mut Matrix,
 }
 
-/// Constants of the energy [N/m].
+/// Constants of the energy (N/m).
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Constants {
     pub(crate) mu: f32,

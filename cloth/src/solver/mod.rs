@@ -21,15 +21,15 @@ use contact::{Friction, Kind, Near, Row};
 use matrix::{Given, Matrix, Scratch, Stop};
 use recover::Recovery;
 
-/// Longest substep [s].
+/// Longest substep (s).
 pub const SUBSTEP_S_MAX: f32 = 1.0 / 120.0;
-/// The body moves at most this far in a substep where that takes no more than 8 times as many [m].
+/// The body moves at most this far in a substep where that takes no more than 8 times as many (m).
 const BODY_WAY_M: f32 = 0.03;
-/// Vertices deeper inside than this at a frame's beginning are given up to the cloth around [m].
+/// Vertices deeper inside than this at a frame's beginning are given up to the cloth around (m).
 const DEPTH_FOUND_M: f32 = 0.12;
 /// How readily a held vertex gives way to the strain limit, against a free one.
 const HELD_SHARE: f32 = 0.02;
-/// No vertex moves faster [m/s].
+/// No vertex moves faster (m/s).
 pub const SPEED_MAX_M_S: f32 = 40.0;
 
 /// The first pass only has to find where the second is to be linearised.
@@ -41,7 +41,7 @@ const SECOND: Stop = Stop { tolerance: 2e-3, iterations: 80 };
 pub struct Span<'a> {
     /// The body's pose at the beginning and at the end; without a body nothing.
     pub motion: Option<(&'a Pose, &'a Pose)>,
-    /// How long it takes [s].
+    /// How long it takes (s).
     pub seconds: f32,
     /// 1, or by how much finer than usual to divide it.
     pub refine: u32,
@@ -181,7 +181,7 @@ impl Workspace {
     }
 
     /// Poses the body at the beginning; returns the longest way of a point of its surface, less
-    /// the root's own shift [m].
+    /// the root's own shift (m).
     fn body_way(&mut self, model: &Model, span: &Span<'_>) -> f32 {
         let (Some(character), Some((from, to))) = (&model.body, span.motion) else { return 0.0 };
         character.body.skin(from, &mut self.joints, &mut self.from.positions);

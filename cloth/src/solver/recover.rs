@@ -9,7 +9,7 @@
 use super::contact::Near;
 use crate::model::Model;
 
-/// A vertex deeper than this at a frame's beginning is led home [m].
+/// A vertex deeper than this at a frame's beginning is led home (m).
 const DEEP_M: f32 = 0.004;
 
 /// A vertex further from the body in the rest pose has no home there: a skirt's hem.

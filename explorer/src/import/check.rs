@@ -67,7 +67,7 @@ pub struct GarmentFigures {
     pub vertices: usize,
     /// Triangles.
     pub triangles: usize,
-    /// Area [m^2].
+    /// Area (m^2).
     pub area_m2: f32,
     /// Longest edge (mm).
     pub edge_length_max_mm: f32,

@@ -95,7 +95,7 @@ pub struct EncodedRegion {
     pub bytes: Vec<u8>,
     /// Largest vertex error of its states, decoded as a client decodes them (m); rounded up.
     pub max_error_m: f32,
-    /// Sum of squared vertex errors over all its states and vertices [m^2].
+    /// Sum of squared vertex errors over all its states and vertices (m^2).
     pub square_sum_m2: f64,
     /// A coefficient was beyond its column's headroom and was held there.
     pub overflowed: bool,
