@@ -118,13 +118,21 @@ pub struct GarmentChunk {
 }
 
 impl SceneChunk {
-    /// Bytes to store.
+    /// Bytes to store, checked.
+    ///
+    /// # Errors
+    /// It breaks a rule of [`SceneChunk::check`], or is longer than a chunk may be.
+    pub fn to_bytes(&self) -> Result<Vec<u8>, DecodeError> {
+        self.check()?;
+        SCENE.to_bytes(self)
+    }
+
+    /// As [`SceneChunk::to_bytes`], for what is known to be good.
     ///
     /// # Panics
-    /// If [`SceneChunk::check`] fails.
+    /// Where that refuses.
     pub fn encode(&self) -> Vec<u8> {
-        self.check().expect("a scene chunk is checked before it is written");
-        SCENE.encode(self)
+        self.to_bytes().expect("a scene chunk is checked before it is written")
     }
 
     /// Reads and checks.
@@ -273,13 +281,21 @@ impl BodyMesh {
 }
 
 impl GarmentChunk {
-    /// Bytes to store.
+    /// Bytes to store, checked.
+    ///
+    /// # Errors
+    /// It breaks a rule of [`GarmentChunk::check`], or is longer than a chunk may be.
+    pub fn to_bytes(&self) -> Result<Vec<u8>, DecodeError> {
+        self.check()?;
+        GARMENT.to_bytes(self)
+    }
+
+    /// As [`GarmentChunk::to_bytes`], for what is known to be good.
     ///
     /// # Panics
-    /// If [`GarmentChunk::check`] fails.
+    /// Where that refuses.
     pub fn encode(&self) -> Vec<u8> {
-        self.check().expect("a garment chunk is checked before it is written");
-        GARMENT.encode(self)
+        self.to_bytes().expect("a garment chunk is checked before it is written")
     }
 
     /// Reads and checks.

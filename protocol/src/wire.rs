@@ -78,12 +78,20 @@ pub(crate) struct Format {
 
 impl Format {
     pub(crate) fn encode<T: Serialize>(&self, value: &T) -> Vec<u8> {
+        self.to_bytes(value).expect("what is written keeps to its limit")
+    }
+
+    /// As [`Format::encode`]; refuses what is too long.
+    pub(crate) fn to_bytes<T: Serialize>(&self, value: &T) -> Result<Vec<u8>, DecodeError> {
         let mut head = Vec::with_capacity(256);
         head.extend_from_slice(&self.magic);
         head.extend_from_slice(&self.version.to_le_bytes());
         let bytes = postcard::to_extend(value, head).expect("writing to memory does not fail");
-        assert!(bytes.len() <= self.bytes_max, "{}: {} bytes are too many", self.what, bytes.len());
-        bytes
+        if bytes.len() > self.bytes_max {
+            let (what, max) = (self.what, self.bytes_max);
+            return Err(DecodeError::TooLong { what, bytes: bytes.len(), max });
+        }
+        Ok(bytes)
     }
 
     /// The value, still to be checked for meaning.
