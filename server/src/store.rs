@@ -8,6 +8,8 @@ use futures::TryStreamExt;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions};
 use protocol::manifest::ManifestError;
+use tokio::sync::OnceCell;
+
 use protocol::{ChunkHash, PublisherKey, SignedManifest, VersionNumber, limits, store};
 
 /// Why something was not read from the store.
@@ -59,11 +61,12 @@ pub enum ReadError {
 pub(crate) struct Source {
     store: Arc<dyn ObjectStore>,
     cache: Mutex<Cache>,
+    reads: Reads,
 }
 
 impl Source {
     pub fn new(store: Arc<dyn ObjectStore>, cache_bytes_max: usize) -> Self {
-        Self { store, cache: Mutex::new(Cache::new(cache_bytes_max)) }
+        Self { store, cache: Mutex::new(Cache::new(cache_bytes_max)), reads: Reads::default() }
     }
 
     /// All versions above `after`, newest first, by listing.
@@ -120,8 +123,13 @@ impl Source {
         Ok(Some(Arc::new(signed)))
     }
 
-    /// A chunk, verified against its name.
+    /// A chunk, verified against its name. Whoever asks while it is being read waits for that
+    /// read: a new version is wanted by every player at once.
     pub async fn chunk(&self, hash: &ChunkHash) -> Result<Bytes, ReadError> {
+        self.reads.share(*hash, || self.read_chunk(hash)).await
+    }
+
+    async fn read_chunk(&self, hash: &ChunkHash) -> Result<Bytes, ReadError> {
         if let Some(bytes) = self.lock().get(hash) {
             return Ok(bytes);
         }
@@ -160,6 +168,46 @@ impl Source {
 
     fn lock(&self) -> std::sync::MutexGuard<'_, Cache> {
         self.cache.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+type Cell = Arc<OnceCell<Bytes>>;
+
+/// Chunks that are being read, each once for all who wait for it.
+#[derive(Debug, Default)]
+struct Reads(Mutex<HashMap<ChunkHash, Cell>>);
+
+impl Reads {
+    /// Reads, or waits for the read under way. Where that one fails or is dropped, the next of
+    /// those who wait reads.
+    async fn share<F>(&self, hash: ChunkHash, read: impl FnOnce() -> F) -> Result<Bytes, ReadError>
+    where
+        F: Future<Output = Result<Bytes, ReadError>>,
+    {
+        let cell = self.lock().entry(hash).or_default().clone();
+        let waiting = Waiting { reads: self, hash, cell };
+        waiting.cell.get_or_try_init(read).await.cloned()
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, HashMap<ChunkHash, Cell>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Somebody who waits for a chunk; the last one forgets it.
+struct Waiting<'a> {
+    reads: &'a Reads,
+    hash: ChunkHash,
+    cell: Cell,
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        let mut reads = self.reads.lock();
+        // Cells are cloned under the lock alone: two owners are the map and this one.
+        if Arc::strong_count(&self.cell) == 2 {
+            reads.remove(&self.hash);
+        }
     }
 }
 
@@ -206,7 +254,32 @@ impl Cache {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    use futures::FutureExt;
+
     use super::*;
+
+    #[tokio::test]
+    async fn a_chunk_wanted_by_many_is_read_once_and_again_after_a_failure() {
+        let (reads, count) = (Reads::default(), AtomicU32::new(0));
+        let hash = ChunkHash::of(b"chunk");
+        let read = || async {
+            let before = count.fetch_add(1, Ordering::Relaxed);
+            tokio::task::yield_now().await;
+            match before {
+                0 => Err(ReadError::Missing("at first".into())),
+                _ => Ok(Bytes::from_static(b"chunk")),
+            }
+        };
+        let all = (0..100).map(|_| reads.share(hash, read));
+        let found = futures::future::join_all(all).await;
+        assert_eq!(found.iter().filter(|found| found.is_err()).count(), 1);
+        assert_eq!(count.load(Ordering::Relaxed), 2);
+        let dropped = reads.share(hash, std::future::pending).now_or_never();
+        assert!(dropped.is_none());
+        assert!(reads.lock().is_empty());
+    }
 
     #[test]
     fn the_cache_keeps_what_was_used_last() {
