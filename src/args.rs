@@ -47,8 +47,8 @@ pub struct Up {
     /// Working data of the explorer [default: beside a local store].
     #[arg(long, value_name = "DIR")]
     pub work: Option<PathBuf>,
-    /// Simulated players.
-    #[arg(long, default_value_t = 3)]
+    /// Simulated players, at most as many as the server takes.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(..=1000))]
     pub players: u32,
     /// Stop after this long, e.g. 60s, 5m [default: until Ctrl-C].
     #[arg(long = "for", value_name = "TIME", value_parser = duration)]
@@ -83,7 +83,7 @@ pub struct Explore {
     #[arg(long)]
     pub frames: Option<u64>,
     /// Stop when no merge is worse than this (mm).
-    #[arg(long, value_name = "MM")]
+    #[arg(long, value_name = "MM", allow_negative_numbers = true)]
     pub error: Option<f32>,
     /// Stop after this long, e.g. 60s, 5m.
     #[arg(long = "for", value_name = "TIME", value_parser = duration)]
@@ -134,8 +134,8 @@ pub struct Play {
     /// random:SEED, clip:A,B,... or edges:FILE.
     #[arg(long, default_value = "random:1")]
     pub walk: String,
-    /// Frames to play.
-    #[arg(long, default_value_t = 300)]
+    /// Frames to play, at least 1.
+    #[arg(long, default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..))]
     pub frames: u64,
     /// At the scene's rate instead of as fast as possible.
     #[arg(long)]
@@ -186,7 +186,7 @@ pub enum SceneCommand {
         /// Built-in scene or a scene file.
         file: String,
         /// Median time to reach a given clip (s); smaller is denser [default: as the file says].
-        #[arg(long, value_name = "SECONDS")]
+        #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
         density: Option<f32>,
         /// Where to write it (the format of `motion_graph.file`).
         #[arg(long, value_name = "FILE.json")]

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, ensure};
 use explorer::cloth_simulator::ClothSimulatorFactory;
 use explorer::explore::{End, ExploreOptions, Place, Progress, Summary, explore};
+use explorer::grow::ledger::Phase;
 use explorer::scene::Scene;
 
 use crate::live::Live;
@@ -60,21 +61,33 @@ pub fn explore_blocking(
     options: &ExploreOptions,
     progress: &mut dyn FnMut(&Progress),
 ) -> Result<Summary> {
-    std::fs::create_dir_all(&work).with_context(|| format!("making {}", work.display()))?;
-    if let Some(folder) = &opened.folder {
-        explorer::pack::collect_leftovers(folder)
-            .with_context(|| format!("clearing half-written files in {}", folder.display()))?;
-    }
-    let key = explorer::pack::load_or_make_key(&work.join("publisher.key"))?;
-    let simulators = ClothSimulatorFactory::new(scene).context("setting up the simulation")?;
-    let place = Place { store: Arc::clone(&opened.store), key, work };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let key_file = work.join("publisher.key");
+    if !key_file.exists() {
+        let owner = runtime.block_on(explorer::pack::publisher(&*opened.store))?;
+        // Nothing is made yet, so that the true folder can still be put into this place.
+        ensure!(
+            owner.is_none(),
+            "the store was published from another work folder than {}, which has no \
+             publisher.key: give its own with --work, or take another store",
+            work.display()
+        );
+    }
+    std::fs::create_dir_all(&work)
+        .with_context(|| format!("the work folder {} cannot be made", work.display()))?;
+    let key = explorer::pack::load_or_make_key(&key_file)?;
+    let simulators = ClothSimulatorFactory::new(scene).context("setting up the simulation")?;
+    let (store, folder) = (Arc::clone(&opened.store), opened.folder.clone());
+    let place = Place { store, folder, key, work };
     Ok(runtime.block_on(explore(scene, &simulators, &place, options, progress))?)
 }
 
 /// One line about an exploration.
 pub fn line(p: &Progress) -> String {
     let version = p.version.map_or("no version yet".into(), |v| format!("version {v}"));
+    if p.phase == Phase::Drape {
+        return "draping the garment".into();
+    }
     if p.best_worst_error_m.is_none() {
         return format!("initial pass: {} of {} frames", p.simulated_frames, p.initial_frames);
     }

@@ -13,13 +13,14 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 pub struct Live {
     bar: Option<ProgressBar>,
     printed: Option<Instant>,
+    said: String,
 }
 
 impl Live {
     /// A bar up to `total` where there is one, else a spinner.
     pub fn new(total: Option<u64>) -> Self {
         if !std::io::stderr().is_terminal() {
-            return Self { bar: None, printed: None };
+            return Self { bar: None, printed: None, said: String::new() };
         }
         let bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::stderr_with_hz(8));
         let template = match total {
@@ -30,7 +31,7 @@ impl Live {
             bar.set_style(style);
         }
         bar.enable_steady_tick(Duration::from_millis(120));
-        Self { bar: Some(bar), printed: None }
+        Self { bar: Some(bar), printed: None, said: String::new() }
     }
 
     /// Tells how far the work is.
@@ -39,16 +40,25 @@ impl Live {
             bar.set_position(position);
             bar.set_message(message());
         } else if self.printed.is_none_or(|at| at.elapsed() >= LINE_EVERY) {
+            let message = message();
+            if message != self.said {
+                eprintln!("{message}");
+            }
+            self.said = message;
             self.printed = Some(Instant::now());
-            eprintln!("{}", message());
         }
     }
 
     /// Prints a line that stays.
-    pub fn note(&self, line: &str) {
+    pub fn note(&mut self, line: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| eprintln!("{line}")),
-            None => eprintln!("{line}"),
+            None if line == self.said => {}
+            None => {
+                eprintln!("{line}");
+                line.clone_into(&mut self.said);
+                self.printed = Some(Instant::now());
+            }
         }
     }
 

@@ -32,10 +32,19 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            eprintln!("error: {}", said_once(&error));
             ExitCode::FAILURE
         }
     }
+}
+
+/// The error and its causes, without those that the sentence before them says already.
+fn said_once(error: &anyhow::Error) -> String {
+    error.chain().map(ToString::to_string).fold(String::new(), |said, cause| match said {
+        said if said.is_empty() => cause,
+        said if said.contains(cause.trim_end()) => said,
+        said => format!("{said}: {cause}"),
+    })
 }
 
 /// Logs go to stderr, warnings and errors only unless asked; `RUST_LOG` overrides.
@@ -48,4 +57,20 @@ fn start_log(verbose: u8) {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(level));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use anyhow::Context;
+
+    #[test]
+    fn a_cause_is_said_once() {
+        let inner = std::io::Error::other("disk full");
+        let repeated = anyhow::Error::new(inner).context("writing x: disk full");
+        assert_eq!(said_once(&repeated), "writing x: disk full");
+        let inner = Err::<(), _>(std::io::Error::other("disk full"));
+        let added = inner.context("writing x").context("publishing").unwrap_err();
+        assert_eq!(said_once(&added), "publishing: writing x: disk full");
+    }
 }

@@ -1,8 +1,8 @@
 //! Where things lie beside a store.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 
 use crate::store::Opened;
 
@@ -26,6 +26,23 @@ pub fn identity(store: &Opened, asked: Option<PathBuf>) -> Result<PathBuf> {
     asked
         .or_else(|| beside(store, ".server"))
         .context("a remote store needs --identity DIR for the server's certificate")
+}
+
+/// Refuses a file that could not be written, before the work for it is done. Leaves nothing there.
+pub fn ensure_writable(file: &Path) -> Result<()> {
+    let folder = file.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    ensure!(folder.is_dir(), "{}: there is no folder {}", file.display(), folder.display());
+    ensure!(!file.is_dir(), "{} is a folder; name a file", file.display());
+    let is_new = !file.exists();
+    std::fs::File::options()
+        .append(true)
+        .create(true)
+        .open(file)
+        .with_context(|| format!("{} cannot be written", file.display()))?;
+    if is_new {
+        std::fs::remove_file(file).with_context(|| format!("removing {}", file.display()))?;
+    }
+    Ok(())
 }
 
 /// As many threads as asked, at least one; by default one per core.

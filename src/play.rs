@@ -1,9 +1,10 @@
 //! `toile play`: a player without a window.
 
+use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use anyhow::Result;
-use client_lib::{Character, Client, ClientConfig, Histogram, Status, Walk, WalkSpec};
+use anyhow::{Result, bail, ensure};
+use client_lib::{Character, Client, ClientConfig, ClientError, Histogram, Status, Walk, WalkSpec};
 use glam::Vec3;
 use serde::Serialize;
 
@@ -11,7 +12,9 @@ use crate::live::Live;
 use crate::record::Recorder;
 use crate::{args, format};
 
-/// How long a player waits for the first version and for what it needs to begin.
+/// How long a player waits for a server that does not answer,
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
+/// and, once it has answered, for the first version and for what it needs to begin.
 const READY_TIMEOUT: Duration = Duration::from_secs(120);
 /// A player that keeps no time waits this often for what lies ahead of it,
 const AHEAD_FRAMES: u64 = 15;
@@ -45,7 +48,7 @@ pub fn run(a: &args::Play) -> Result<()> {
         token: a.token.clone(),
         ..ClientConfig::new(a.connect.to_string())
     })?;
-    client.wait_ready(READY_TIMEOUT)?;
+    wait_ready(&client, a.connect)?;
     let mut character = client.character(None)?;
     let scene = character.version().scene().clone();
     let mut walk = Walk::new(&spec, &scene, character.pose())?;
@@ -78,6 +81,29 @@ pub fn run(a: &args::Play) -> Result<()> {
     }
     print(&summary);
     Ok(())
+}
+
+/// Waits for the first version: long where a server is there, not where nobody answers.
+fn wait_ready(client: &Client, address: SocketAddr) -> Result<()> {
+    let start = Instant::now();
+    let mut answered = false;
+    loop {
+        let limit = if answered { READY_TIMEOUT } else { ANSWER_TIMEOUT };
+        let left = limit.saturating_sub(start.elapsed());
+        match client.wait_ready(left.min(Duration::from_millis(500))) {
+            Err(ClientError::NotReady { .. }) => answered |= client.status().connected,
+            ended => return Ok(ended?),
+        }
+        if start.elapsed() >= limit {
+            let why = client.status().error.unwrap_or("it has published no version yet".into());
+            ensure!(
+                answered,
+                "no toile server answers at {address} (QUIC, UDP): {why}; is `toile serve` or \
+                 `toile up` running, and is this its quic address?"
+            );
+            bail!("the server at {address} gave nothing to play in {limit:?}: {why}");
+        }
+    }
 }
 
 /// What is measured on each frame.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use explorer::import::check::check_scene;
 use explorer::import::compute::Density;
 use explorer::import::{data_dir, load_scene, scene_graph};
@@ -10,7 +10,7 @@ use explorer::scene::Scene;
 use glam::Vec3;
 use picture::{Camera, Layer, Paint, Sheet, View};
 
-use crate::{args, format};
+use crate::{args, format, place};
 
 /// Runs `toile scene ...`.
 pub fn run(a: args::Scene) -> Result<()> {
@@ -18,6 +18,7 @@ pub fn run(a: args::Scene) -> Result<()> {
         args::SceneCommand::Check { file, json } => check(&file, json),
         args::SceneCommand::Graph { file, density, out } => graph(&file, density, &out),
         args::SceneCommand::Picture { file, out } => {
+            place::ensure_writable(&out)?;
             let scene = load(&file)?;
             std::fs::write(&out, sheet(&scene)?)
                 .with_context(|| format!("writing {}", out.display()))
@@ -89,6 +90,10 @@ fn check(file: &str, json: bool) -> Result<()> {
 }
 
 fn graph(file: &str, seconds: Option<f32>, out: &Path) -> Result<()> {
+    ensure!(file != "robe", "robe is built in with its own motion graph: there is none to compute");
+    let sensible = seconds.is_none_or(|s| s.is_finite() && s > 0.0);
+    ensure!(sensible, "--density {}: seconds, above 0", seconds.unwrap_or_default());
+    place::ensure_writable(out)?;
     let density = seconds.map(Density::Reach);
     let graph = scene_graph(file, data_dir().as_deref(), density)?;
     std::fs::write(out, graph.to_json()).with_context(|| format!("writing {}", out.display()))?;

@@ -32,6 +32,7 @@ pub struct Opened {
 pub fn open_store(text: &str) -> Result<Opened> {
     match place(text)? {
         Place::Folder(folder) => {
+            ensure_no_file(&folder)?;
             ensure!(
                 folder.is_dir(),
                 "there is no store in {}: no such folder (`toile explore` makes one)",
@@ -50,6 +51,7 @@ pub fn open_store(text: &str) -> Result<Opened> {
 pub fn create_store(text: &str) -> Result<Opened> {
     match place(text)? {
         Place::Folder(folder) => {
+            ensure_no_file(&folder)?;
             std::fs::create_dir_all(&folder)
                 .with_context(|| format!("the folder {} cannot be made", folder.display()))?;
             open_folder(&folder)
@@ -78,6 +80,11 @@ fn place(text: &str) -> Result<Place> {
         "s3" => Ok(Place::Bucket(url)),
         other => bail!("stores of kind {other}:// are not supported; {SUPPORTED}"),
     }
+}
+
+fn ensure_no_file(folder: &Path) -> Result<()> {
+    ensure!(!folder.is_file(), "{} is a file; {SUPPORTED}", folder.display());
+    Ok(())
 }
 
 fn open_folder(folder: &Path) -> Result<Opened> {
@@ -191,7 +198,7 @@ mod tests {
         #[cfg(unix)]
         assert!(refusal("file://host/folder").contains("another machine"));
         let file = tempfile::NamedTempFile::new().unwrap();
-        assert!(refusal(file.path().to_str().unwrap()).contains("cannot be made"));
+        assert!(refusal(file.path().to_str().unwrap()).contains("is a file"));
         assert!(open_store(file.path().to_str().unwrap()).is_err());
     }
 

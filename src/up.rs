@@ -144,14 +144,14 @@ fn watch(
         if stats.version > version {
             version = stats.version;
             watched.first_version.get_or_insert(start.elapsed());
-            let said = progress.as_ref().map(line).unwrap_or_default();
+            let said = progress.as_ref().map_or("is in the store already".into(), line);
             live.note(&format!(
                 "{:6.1} s  version {version}: {said}",
                 start.elapsed().as_secs_f64()
             ));
         }
         live.tell(version, || {
-            let said = progress.as_ref().map_or("draping the garment".into(), line);
+            let said = progress.as_ref().map_or("starting".into(), line);
             format!("{said} | {}", players_line(&players.totals(), stats.bytes_sent))
         });
     }

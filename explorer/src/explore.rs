@@ -14,7 +14,7 @@ use crate::grow::ledger::Phase;
 use crate::grow::record::PublishRecord;
 use crate::grow::round::{self, Ended, RoundError};
 use crate::grow::work::{Work, WorkError};
-use crate::pack::{EncodeSettings, PublishError, Publisher};
+use crate::pack::{EncodeSettings, PublishError, Publisher, collect_leftovers};
 use crate::scene::Scene;
 use crate::simulator::{FrameQuality, SimulateError, Simulator, SimulatorFactory};
 use crate::view::GraphView;
@@ -150,6 +150,14 @@ pub enum ExploreError {
     /// A version could not be published.
     #[error("publishing: {0}")]
     Publish(#[from] PublishError),
+    /// Half-written files in the store could not be removed.
+    #[error("half-written files in {} cannot be removed: {source}", .folder.display())]
+    Leftovers {
+        /// The store's folder.
+        folder: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
     /// The store holds states that the work folder does not know.
     #[error(
         "the store holds {stored} states of this garment, the work folder {} only {known}: give \
@@ -170,6 +178,8 @@ pub enum ExploreError {
 pub struct Place {
     /// Where versions are published.
     pub store: Arc<dyn ObjectStore>,
+    /// Its folder, where it is one on this machine: cleared of what a killed run left half-written.
+    pub folder: Option<PathBuf>,
     /// Signs them; the same for every run on a store.
     pub key: SigningKey,
     /// The work folder: exact states and the journal. Made if it is missing.
@@ -201,6 +211,11 @@ pub async fn explore(
     let settings = EncodeSettings::for_rank(usize::from(scene.exploration.rank_max));
     let (store, key) = (Arc::clone(&place.store), place.key.clone());
     let publisher = Publisher::open(store, scene, key, settings).await?;
+    // Only now: the folder is locked and the store is ours, so that nobody else is writing there.
+    if let Some(folder) = &place.folder {
+        collect_leftovers(folder)
+            .map_err(|source| ExploreError::Leftovers { folder: folder.clone(), source })?;
+    }
     let mut publisher = Garment(publisher, &scene.garment.name);
     let setup = Setup { scene, simulators, work: &place.work, options };
     run(setup, work, &mut publisher, progress).await
@@ -260,6 +275,7 @@ async fn run(
     // A store that lost versions, or a new one for an old folder, is brought up to date at once.
     let mut behind = work.ledger().published().is_some_and(|p| head < Some(p.number));
     let stop = || (options.should_stop)();
+    progress(&progress_of(&work, None));
     loop {
         if work.ledger().round().is_done() {
             if work.ledger().phase() == Phase::Drape {

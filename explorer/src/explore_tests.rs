@@ -393,6 +393,7 @@ fn the_published_store_is_equal_for_any_workers_and_after_any_stop() {
         let summary = (0..500).find_map(|_| {
             let place = Place {
                 store: crate::pack::local_store(&root).unwrap(),
+                folder: Some(root.clone()),
                 key: SigningKey::from_seed(&[7; 32]),
                 work: folder.path().join("work"),
             };

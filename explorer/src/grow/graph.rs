@@ -211,7 +211,8 @@ impl Graph {
     /// Mean merge error (m); 0 without dead ends.
     pub fn mean_error_m(&self) -> f32 {
         let sum: f64 = self.queue.iter().map(|(_, error_m)| f64::from(error_m)).sum();
-        (sum / self.queue.len().max(1) as f64) as f32
+        // The sum of nothing is -0.
+        ((sum + 0.0) / self.queue.len().max(1) as f64) as f32
     }
 
     /// The commit with the lowest worst error since the initial pass, of equals the last (the

@@ -21,4 +21,4 @@ pub use inspect::{GarmentInspection, InspectError, Inspection, inspect};
 pub use key::{KeyError, load_or_make_key};
 pub use publish::{Prepared, PublishError, Published, Publisher};
 pub use regions::RunsError;
-pub use store::{StoreError, collect_leftovers, local_store};
+pub use store::{StoreError, collect_leftovers, local_store, publisher};

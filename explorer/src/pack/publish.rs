@@ -8,6 +8,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use bytes::Bytes;
+use futures::TryStreamExt;
 use object_store::ObjectStore;
 use protocol::links::{LinkEntry, LinkPage};
 use protocol::manifest::{ChunkRef, GarmentVersion, GenerationRef, VersionStats};
@@ -23,6 +24,10 @@ use super::scene_chunk::{garment_chunk, scene_chunk};
 use super::store::{self, NewChunks, StoreError};
 use crate::scene::Scene;
 use crate::view::GraphView;
+
+/// Chunks written at the same time: a put waits for the disk or the network, not for the CPU.
+/// Their order is of no effect, since nobody looks for them before the manifest is there.
+const PUTS_MAX: usize = 8;
 
 /// Why nothing was published; the head is as it was.
 #[derive(Debug, thiserror::Error)]
@@ -44,7 +49,10 @@ pub enum PublishError {
     #[error("encoding: {0}")]
     Encode(#[from] EncodeError),
     /// The store belongs to another key.
-    #[error("the store belongs to publisher {found}, but this key is {ours}")]
+    #[error(
+        "the store belongs to publisher {found}, but this key is {ours}; give the work folder \
+         that the store was published from, or take another store"
+    )]
     OtherPublisher {
         /// Whose it is.
         found: PublisherKey,
@@ -225,9 +233,10 @@ impl Publisher {
         if self.next_number() != number {
             return Err(PublishError::Conflict(number));
         }
-        for (hash, bytes) in &chunks.chunks {
-            put_chunk(&*self.store, hash, bytes).await?;
-        }
+        let store = &*self.store;
+        let puts = futures::stream::iter(chunks.chunks.iter().map(Ok));
+        puts.try_for_each_concurrent(PUTS_MAX, |(hash, bytes)| put_chunk(store, hash, bytes))
+            .await?;
         let signed = manifest.clone().sign(&self.key).encode();
         let path = protocol::store::version_path(number);
         if !store::create(&*self.store, &path, signed).await? {
@@ -374,14 +383,12 @@ impl Fixed {
     fn new(scene: &Scene) -> Result<Self, PublishError> {
         let chunk = scene_chunk(scene);
         let mesh = garment_chunk(scene);
-        chunk.check()?;
-        mesh.check()?;
         Ok(Self {
             name: scene.garment.name.clone(),
             vertex_count: scene.garment.positions.len(),
             pose_count: chunk.poses.len(),
-            scene: chunk.encode(),
-            mesh: mesh.encode(),
+            scene: chunk.to_bytes()?,
+            mesh: mesh.to_bytes()?,
             edges: chunk.edges,
         })
     }

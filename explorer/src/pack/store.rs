@@ -46,7 +46,10 @@ pub enum StoreError {
     #[error("the store has no version yet; `toile explore` or `toile up` publishes one")]
     Empty,
     /// A manifest that cannot be read or is not the publisher's.
-    #[error("version {number}: {source}")]
+    #[error(
+        "version {number}: {source}; restore {} from a copy, or remove it: exploring publishes \
+         it again", store::version_path(*.number)
+    )]
     Manifest {
         /// Its number.
         number: VersionNumber,
