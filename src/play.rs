@@ -69,7 +69,8 @@ pub fn run(a: &args::Play) -> Result<()> {
         recorder.frame(&character, &measures.world)?;
         live.tell(frame + 1, || {
             let stats = character.stats();
-            format!("{} exact, {} substituted", stats.exact, stats.substituted)
+            let (exact, substituted) = (stats.exact, stats.substituted);
+            format!("{} frames: {exact} exact, {substituted} substituted", frame + 1)
         });
     }
     live.done();
@@ -95,12 +96,14 @@ fn wait_ready(client: &Client, address: SocketAddr) -> Result<()> {
             ended => return Ok(ended?),
         }
         if start.elapsed() >= limit {
-            let why = client.status().error.unwrap_or("it has published no version yet".into());
+            let why = client.status().error;
             ensure!(
                 answered,
-                "no toile server answers at {address} (QUIC, UDP): {why}; is `toile serve` or \
-                 `toile up` running, and is this its quic address?"
+                "no toile server answers at {address} (QUIC, UDP): {}; is `toile serve` or \
+                 `toile up` running, and is this its quic address?",
+                why.unwrap_or(format!("nothing came in {limit:?}"))
             );
+            let why = why.unwrap_or("it has no whole version yet".into());
             bail!("the server at {address} gave nothing to play in {limit:?}: {why}");
         }
     }

@@ -120,7 +120,7 @@ fn shot(
     let triangles = &version.mesh().triangles;
     layers.push(Layer { positions: cloth, triangles, paint: Paint::CLOTH });
     // The camera keeps its height while the character is on the ground, so that a jump shows.
-    let target = Vec3::new(hips.x, 0.85_f32.max(hips.y - 0.35), hips.z);
+    let target = Vec3::new(hips.x, 0.85_f32.max(hips.y - 0.15), hips.z);
     let view = View::new(Camera::around(target, 4.4), 300, 380);
     Ok(picture::render(&view, &layers)?)
 }

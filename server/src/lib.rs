@@ -105,7 +105,7 @@ pub enum StartError {
     #[error(transparent)]
     Identity(#[from] IdentityError),
     /// A port is taken or not allowed.
-    #[error("cannot listen on {address} ({what}): {source}")]
+    #[error("cannot listen on {address} ({what}): {source}; choose another address or port")]
     Listen {
         /// `QUIC` or `HTTP`.
         what: &'static str,
