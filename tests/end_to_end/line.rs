@@ -85,7 +85,7 @@ fn up_explores_serves_and_plays_and_goes_on_where_it_stopped() {
     let up = |time: &str| {
         toile_json(&["up", "--store", path(&store), "--for", time, "--players", "2", "--json"])
     };
-    let first = up("45s");
+    let first = up("60s");
     assert!(first["versions"].as_u64().unwrap() >= 1, "{first}");
     assert_eq!(first["players"], 2);
     assert_eq!(first["frames_missed"], 0);
