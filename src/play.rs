@@ -57,7 +57,10 @@ pub fn run(a: &args::Play) -> Result<()> {
     let tick = Duration::from_secs_f32(1.0 / scene.fps());
     let start = Instant::now();
     for frame in 0..a.frames {
-        let Some(next) = walk.next() else { break };
+        let Some(next) = walk.next() else {
+            live.note(&format!("the walk ends after {frame} of {} frames", a.frames));
+            break;
+        };
         if a.realtime {
             let due = start + tick * u32::try_from(frame).unwrap_or(u32::MAX);
             std::thread::sleep(due.saturating_duration_since(Instant::now()));

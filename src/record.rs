@@ -78,7 +78,8 @@ impl Recorder {
     /// Writes the files.
     pub fn finish(self, character: &Character) -> Result<()> {
         if let Some(file) = &self.picture {
-            let title = format!("{}, version {}", "walk", character.version().number());
+            let version = character.version();
+            let title = format!("{}, version {}", version.mesh().name, version.number());
             write(file, &self.sheet.titled(title).image()?.png()?)?;
         }
         let Some(file) = &self.export else { return Ok(()) };
