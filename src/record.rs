@@ -1,5 +1,6 @@
 //! What `toile play` writes for people who look: an animated glTF file, a contact sheet.
 
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use crate::place;
@@ -12,10 +13,12 @@ use picture::{Camera, Layer, Paint, Sheet, View};
 /// Pictures of a contact sheet.
 const SHOTS: u64 = 40;
 const SHEET_COLUMNS: u32 = 8;
-/// The body is drawn this much thinner than it was simulated against (m). Merging, blending and
+/// Under cloth the body is drawn this much thinner than it was simulated against (m). Merging, blending and
 /// lossy coding move cloth by more than the gap that contact keeps, and skin that pokes through by
 /// a hair is seen at once, while a thinner body under cloth is not (Kim et al. 2013, section 4).
 const BODY_INSET_M: f32 = 0.005;
+/// What is further from any cloth than about this, face and hands, keeps its shape (m).
+const COVERED_M: f32 = 0.03;
 const BODY: picture::Rgb = [196, 176, 160];
 const CLOTH: picture::Rgb = [72, 118, 196];
 
@@ -61,8 +64,7 @@ impl Recorder {
         let mut body = Vec::new();
         if let Some(mesh) = version.scene().body() {
             mesh.skin(&pose, &mut self.joints, &mut body);
-            let normals = picture::raster::normals(&body, &mesh.triangles);
-            body.iter_mut().zip(normals).for_each(|(p, n)| *p -= BODY_INSET_M * n);
+            inset(&mut body, &mesh.triangles, cloth);
         }
         if shoot {
             let picture = shot(character, &body, cloth, pose.root)?;
@@ -103,6 +105,23 @@ impl Recorder {
         });
         let clip = Clip { rate: version.scene().fps(), normals: true, meshes: &meshes };
         write(file, &picture::glb::glb(&clip)?)
+    }
+}
+
+/// Draws the body inwards where it is near cloth: vertices whose cell of a grid, or one beside it,
+/// holds a vertex of the cloth.
+fn inset(body: &mut [Vec3], triangles: &[[u32; 3]], cloth: &[Vec3]) {
+    let cell = |p: &Vec3| (*p / COVERED_M).to_array().map(|c| c.floor() as i32);
+    let covered: HashSet<[i32; 3]> = cloth.iter().map(cell).collect();
+    let beside = |at: i32| at.saturating_sub(1)..=at.saturating_add(1);
+    let near_cloth = |[x, y, z]: [i32; 3]| {
+        beside(x).any(|x| beside(y).any(|y| beside(z).any(|z| covered.contains(&[x, y, z]))))
+    };
+    let normals = picture::raster::normals(body, triangles);
+    for (p, n) in body.iter_mut().zip(normals) {
+        if near_cloth(cell(p)) {
+            *p -= BODY_INSET_M * n;
+        }
     }
 }
 
