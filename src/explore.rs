@@ -92,9 +92,8 @@ pub fn line(p: &Progress) -> String {
         return format!("initial pass: {} of {} frames", p.simulated_frames, p.initial_frames);
     }
     format!(
-        "{} frames, {} states, worst merge {:.1} mm, mean {:.1} mm, {version}",
+        "{} frames, worst merge {:.1} mm, mean {:.1} mm, {version}",
         p.simulated_frames,
-        p.states,
         format::mm(p.worst_error_m),
         format::mm(p.mean_error_m),
     )

@@ -25,7 +25,8 @@ impl Live {
         let bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::stderr_with_hz(8));
         let template = match total {
             Some(_) => "[{elapsed_precise}] {bar:24} {pos}/{len} {wide_msg}",
-            None => "[{elapsed_precise}] {spinner} {wide_msg}",
+            // The prefix is the second line of what is told, where there is one.
+            None => "[{elapsed_precise}] {spinner} {wide_msg}{prefix}",
         };
         if let Ok(style) = ProgressStyle::with_template(template) {
             bar.set_style(style);
@@ -34,13 +35,18 @@ impl Live {
         Self { bar: Some(bar), printed: None, said: String::new() }
     }
 
-    /// Tells how far the work is.
+    /// Tells how far the work is. On a terminal a spinner shows a second line of the message below the
+    /// first, so that 80 columns are enough for both.
     pub fn tell(&mut self, position: u64, message: impl FnOnce() -> String) {
         if let Some(bar) = &self.bar {
             bar.set_position(position);
-            bar.set_message(message());
-        } else if self.printed.is_none_or(|at| at.elapsed() >= LINE_EVERY) {
             let message = message();
+            let (first, second) = message.split_once('\n').unwrap_or((&message, ""));
+            let gap = if second.is_empty() { "" } else { "\n             " };
+            bar.set_message(first.to_owned());
+            bar.set_prefix(format!("{gap}{second}"));
+        } else if self.printed.is_none_or(|at| at.elapsed() >= LINE_EVERY) {
+            let message = message().replace('\n', " | ");
             if message != self.said {
                 eprintln!("{message}");
             }

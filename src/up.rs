@@ -152,7 +152,7 @@ fn watch(
         }
         live.tell(version, || {
             let said = progress.as_ref().map_or("starting".into(), line);
-            format!("{said} | {}", players_line(&players.totals(), stats.bytes_sent))
+            format!("{said}\n{}", players_line(&players.totals(), stats.bytes_sent))
         });
     }
     live.done();
