@@ -45,7 +45,7 @@ pub enum SceneFileError {
     #[error("{0}")]
     Toml(String),
     /// More than one garment.
-    #[error("[garment] is given {0} times; a scene has exactly one garment for now: keep one")]
+    #[error("[garment] is given {0} times; a scene has exactly one garment: keep one")]
     Garments(usize),
     /// A value.
     #[error("{key}: {problem}")]
