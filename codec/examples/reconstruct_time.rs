@@ -1,4 +1,4 @@
-//! Prints the time of one reconstruction: `cargo run --release -p toile-codec --example
+//! Prints the time of one reconstruction: `cargo run --release -p codec --example
 //! reconstruct_time [ROWS COLUMNS CHARACTERS]`. A third of the columns is 16 bits wide.
 
 use std::time::Instant;

@@ -2,7 +2,7 @@
 //! draped start, and prints what was measured:
 //!
 //! ```text
-//! cargo run --release -p toile-explorer --example initial_pass -- dress (frames) [clip ...]
+//! cargo run --release -p explorer --example initial_pass -- dress (frames) [clip ...]
 //! ```
 //!
 //! `robe` is built in; anything else is `dress` or a scene file. With clips named, only edges into

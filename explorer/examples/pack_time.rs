@@ -1,4 +1,4 @@
-//! Prints what packing costs on made-up states: `cargo run --release -p toile-explorer --example
+//! Prints what packing costs on made-up states: `cargo run --release -p explorer --example
 //! pack_time [VERTICES STATES RANK]`.
 
 use std::time::Instant;
