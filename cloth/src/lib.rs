@@ -27,7 +27,7 @@ pub mod triangle;
 
 pub use body::{Body, Pose, Skeleton};
 pub use glam::{Quat, Vec3};
-pub use material::Material;
+pub use material::{Material, MembraneStiffness};
 pub use mesh::{Mesh, MeshError};
 pub use model::{Environment, Model, ModelError, State};
 pub use rigid::Rigid;

@@ -24,7 +24,8 @@ pub struct Mesh {
     rest_lengths: Vec<f32>,
     hinges: Vec<Hinge>,
     rest_areas: Vec<f32>,
-    /// Gradients of the three hat functions in each triangle's own rest plane [1/m].
+    /// Gradients of the three hat functions in each triangle's rest plane, along warp and weft
+    /// [1/m].
     shape_gradients: Vec<[Vec2; 3]>,
     vertex_areas: Vec<f32>,
 }
@@ -133,7 +134,39 @@ impl Mesh {
         if let Some(vertex) = mesh.vertex_areas.iter().position(|a| *a <= 0.0) {
             return Err(MeshError::Isolated { vertex });
         }
-        Ok(mesh)
+        Ok(mesh.with_grain(Vec3::Y))
+    }
+
+    /// The same mesh with its warp along `direction`, as seen from each rest triangle's plane. Where
+    /// a triangle is nearly normal to it, the warp is along the next axis (x, then z for
+    /// `direction` = x). [`Mesh::new`] takes y, as garments are cut; only an orthotropic
+    /// material feels it.
+    pub fn with_grain(self, direction: Vec3) -> Self {
+        let direction = direction.try_normalize().unwrap_or(Vec3::Y);
+        let count = self.triangles.len();
+        self.with_grains((0..count).map(|_| direction))
+    }
+
+    /// The same mesh with a warp direction for each triangle, for example the direction in which u
+    /// grows; missing ones stay as they are.
+    pub fn with_grains(mut self, directions: impl IntoIterator<Item = Vec3>) -> Self {
+        for (index, wanted) in directions.into_iter().take(self.triangles.len()).enumerate() {
+            let [p, q, r] = self.triangles[index].map(|v| self.rest_positions[v as usize]);
+            let axis = (q - p).normalize();
+            let across = axis.cross(r - p).cross(axis).normalize();
+            let other = if wanted.x.abs() > 0.9 { Vec3::Z } else { Vec3::X };
+            let flat = |d: Vec3| Vec2::new(d.dot(axis), d.dot(across));
+            let [first, second] = [flat(wanted), flat(other)];
+            let steep = first.length_squared() > 0.01 * wanted.length_squared();
+            let warp = if steep { first } else { second }.try_normalize().unwrap_or(Vec2::X);
+            let (a, b) = ((q - p).length(), flat(r - p));
+            // Rows of the inverse of [[a, b.x], [0, b.y]].
+            let g1 = Vec2::new(1.0 / a, -b.x / (a * b.y));
+            let g2 = Vec2::new(0.0, 1.0 / b.y);
+            let turned = |g: Vec2| Vec2::new(g.dot(warp), g.dot(warp.perp()));
+            self.shape_gradients[index] = [-g1 - g2, g1, g2].map(turned);
+        }
+        self
     }
 
     fn measure_rest_shape(&mut self) -> Result<(), MeshError> {
@@ -148,14 +181,8 @@ impl Mesh {
             if 2.0 * area_m2 <= SLIVER * edge_m * edge_m || shortest < EDGE_M_MIN {
                 return Err(MeshError::Degenerate { triangle, area_m2, edge_m });
             }
-            let axis = d1.normalize();
-            let a = d1.length();
-            let b = Vec2::new(d2.dot(axis), 2.0 * area_m2 / a);
-            // Rows of the inverse of [[a, b.x], [0, b.y]].
-            let g1 = Vec2::new(1.0 / a, -b.x / (a * b.y));
-            let g2 = Vec2::new(0.0, 1.0 / b.y);
             self.rest_areas.push(area_m2);
-            self.shape_gradients.push([-g1 - g2, g1, g2]);
+            self.shape_gradients.push([Vec2::ZERO; 3]);
             for v in t {
                 self.vertex_areas[*v as usize] += area_m2 / 3.0;
             }
@@ -198,7 +225,8 @@ impl Mesh {
         &self.rest_areas
     }
 
-    /// Gradients of the three hat functions in each triangle's rest plane [1/m].
+    /// Gradients of the three hat functions in each triangle's rest plane, along warp and weft
+    /// [1/m].
     pub fn shape_gradients(&self) -> &[[Vec2; 3]] {
         &self.shape_gradients
     }
@@ -258,7 +286,27 @@ mod tests {
         // Hat gradients sum to zero and reproduce a linear function.
         let g = mesh.shape_gradients()[0];
         assert!((g[0] + g[1] + g[2]).length() < 1e-6);
-        assert!((g[1] - Vec2::new(1.0, -1.0)).length() < 1e-6);
+        assert!((g[1].length() - 2.0f32.sqrt()).abs() < 1e-6);
+    }
+
+    #[test]
+    fn the_warp_is_the_grain_as_seen_from_each_triangle() {
+        let (p, t) = square();
+        let mesh = Mesh::new(p.clone(), t).unwrap();
+        let slopes = |mesh: &Mesh, linear: Vec3| -> Vec<Vec2> {
+            let value = |v: u32| p[v as usize].dot(linear);
+            let shapes = mesh.triangles().iter().zip(mesh.shape_gradients());
+            shapes.map(|(t, g)| t.iter().zip(g).map(|(v, g)| *g * value(*v)).sum()).collect()
+        };
+        let near = |found: Vec<Vec2>, wanted: Vec2| {
+            assert!(found.iter().all(|f| (*f - wanted).length() < 1e-5), "{found:?} {wanted}");
+        };
+        near(slopes(&mesh, Vec3::Y), Vec2::X);
+        let mesh = mesh.with_grain(Vec3::X);
+        near(slopes(&mesh, Vec3::X), Vec2::X);
+        near(slopes(&mesh, Vec3::Y), Vec2::Y);
+        // Normal to the sheet: the next axis.
+        near(slopes(&mesh.with_grain(Vec3::Z), Vec3::X), Vec2::X);
     }
 
     #[test]

@@ -1,13 +1,20 @@
-//! Stretch and shear: an isotropic energy of the two principal stretches of each triangle.
+//! Stretch and shear: an isotropic energy of the two principal stretches of each triangle, and
+//! what an orthotropic cloth has besides along warp and weft.
 //!
 //! Per rest area `mu sum (s_i - 1)^2 + lambda/2 (s_1 + s_2 - 2)^2`, and past `SOFT_STRAIN` a
 //! stiffer term: the strain limit. The Hessian in the space of the deformation gradient has known
 //! eigenvectors (Kim & Eberle 2022, "Dynamic Deformables", chapter 7, here for 3 x 2): scaling,
 //! twist, flip, and two turns out of the plane. Negative eigenvalues are set to zero.
+//!
+//! The orthotropic part is `k1/2 (|w| - 1)^2 + k2/2 (|f| - 1)^2 + k12/2 cos^2(w, f)`, with w and f
+//! the images of warp and weft: springs as in Baraff & Witkin 1998, section 4, with the shear by its
+//! angle, so that it does not grow with stretch. Springs keep their tension's positive part, the
+//! shear its Gauss-Newton part.
 
 use glam::{Mat3A, Vec2, Vec3A};
 
 use super::matrix::{Matrix, Pattern};
+use crate::material::MembraneStiffness;
 use crate::mesh::Mesh;
 
 /// Principal strain from which a triangle stiffens.
@@ -24,16 +31,18 @@ pub(crate) struct Sums<'a> {
 /// Constants of the energy (N/m).
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Constants {
-    pub(crate) mu: f32,
-    pub(crate) lambda: f32,
-    pub(crate) limit: f32,
+    sum: MembraneStiffness,
+    orthotropic: bool,
+    limit: f32,
 }
 
 impl Constants {
     /// From a material's stiffnesses.
     pub(crate) fn new(material: &crate::Material) -> Self {
-        let (mu, lambda) = material.lame();
-        Self { mu, lambda, limit: LIMIT_FACTOR * material.stretch }
+        let sum = material.membrane();
+        let stiffest = material.weft.map_or(material.stretch, |weft| weft.max(material.stretch));
+        let orthotropic = sum.warp.max(sum.weft).max(sum.shear) > 0.0;
+        Self { sum, orthotropic, limit: LIMIT_FACTOR * stiffest }
     }
 }
 
@@ -59,7 +68,17 @@ pub(crate) fn assemble(
             forces[v] -= (e.u1 * (push.x * b.x) + e.u2 * (push.y * b.y)) * *area;
         }
         let block = |a: usize, b: usize| e.block(&modes, beta[a], beta[b], area * scale);
-        let (h01, h02, h12) = (block(0, 1), block(0, 2), block(1, 2));
+        let (mut h01, mut h02, mut h12) = (block(0, 1), block(0, 2), block(1, 2));
+        if constants.orthotropic {
+            let axes = Axes::new([x[i], x[j], x[k]], gradients, &constants.sum);
+            for (v, g) in [i, j, k].into_iter().zip(gradients) {
+                forces[v] -= axes.push(*g) * *area;
+            }
+            let [g0, g1, g2] = *gradients;
+            h01 += axes.block(g0, g1) * (area * scale);
+            h02 += axes.block(g0, g2) * (area * scale);
+            h12 += axes.block(g1, g2) * (area * scale);
+        }
         let (h10, h20, h21) = (h01.transpose(), h02.transpose(), h12.transpose());
         for (slot, h) in slots.iter().zip([h01, h10, h02, h20, h12, h21]) {
             matrix.near[*slot as usize] += h;
@@ -116,21 +135,22 @@ impl Element {
     fn respond(&self, c: Constants) -> (Vec2, Modes) {
         let s = self.stretch;
         let over = (s - Vec2::splat(1.0 + SOFT_STRAIN)).max(Vec2::ZERO);
-        let trace = c.lambda * (s.x + s.y - 2.0);
-        let push = (s - 1.0) * (2.0 * c.mu) + trace + over * c.limit;
+        let (mu, lambda) = (c.sum.mu, c.sum.lambda);
+        let trace = lambda * (s.x + s.y - 2.0);
+        let push = (s - 1.0) * (2.0 * mu) + trace + over * c.limit;
         let stiff = |over: f32| if over > 0.0 { c.limit } else { 0.0 };
         let (k1, k2) = (stiff(over.x), stiff(over.y));
         let difference = s.x - s.y;
         let flip = if difference > 1e-4 {
-            2.0 * c.mu + c.limit * (over.x - over.y) / difference
+            2.0 * mu + c.limit * (over.x - over.y) / difference
         } else {
-            2.0 * c.mu + k1
+            2.0 * mu + k1
         };
         let twist = ((push.x + push.y) / (s.x + s.y)).max(0.0);
         let modes = Modes {
-            s11: 2.0 * c.mu + c.lambda + k1,
-            s22: 2.0 * c.mu + c.lambda + k2,
-            s12: c.lambda,
+            s11: 2.0 * mu + lambda + k1,
+            s22: 2.0 * mu + lambda + k2,
+            s12: lambda,
             same: 0.5 * (twist + flip),
             cross: 0.5 * (flip - twist),
             out: (push / s).max(Vec2::ZERO),
@@ -153,6 +173,54 @@ impl Element {
     }
 }
 
+/// A triangle's orthotropic part: warp and weft in space, and their Hessians.
+struct Axes {
+    push: [Vec3A; 2],
+    springs: [Mat3A; 2],
+    /// Slopes of the cosine between warp and weft, times the root of the shear stiffness.
+    slopes: [Vec3A; 2],
+}
+
+impl Axes {
+    fn new(x: [Vec3A; 3], g: &[Vec2; 3], k: &MembraneStiffness) -> Self {
+        let image = |of: fn(&Vec2) -> f32| {
+            let f = x[0] * of(&g[0]) + x[1] * of(&g[1]) + x[2] * of(&g[2]);
+            let length = f.length().max(1e-4);
+            (f / length, length)
+        };
+        let (warp, weft) = (image(|g| g.x), image(|g| g.y));
+        let spring = |(n, length): (Vec3A, f32), k: f32| {
+            let along = Mat3A::from_cols(n * n.x, n * n.y, n * n.z);
+            let turn = (1.0 - 1.0 / length).max(0.0);
+            (n * (k * (length - 1.0)), along * (k * (1.0 - turn)) + Mat3A::IDENTITY * (k * turn))
+        };
+        let ((push1, spring1), (push2, spring2)) = (spring(warp, k.warp), spring(weft, k.weft));
+        let (n1, n2) = (warp.0, weft.0);
+        let cosine = n1.dot(n2);
+        let root = k.shear.sqrt();
+        // Where a side has collapsed, its angle says little.
+        let slopes = [
+            (n2 - n1 * cosine) * (root / warp.1.max(0.2)),
+            (n1 - n2 * cosine) * (root / weft.1.max(0.2)),
+        ];
+        let shear = root * cosine;
+        let push = [push1 + slopes[0] * shear, push2 + slopes[1] * shear];
+        Self { push, springs: [spring1, spring2], slopes }
+    }
+
+    fn push(&self, g: Vec2) -> Vec3A {
+        self.push[0] * g.x + self.push[1] * g.y
+    }
+
+    fn block(&self, a: Vec2, b: Vec2) -> Mat3A {
+        let left = self.slopes[0] * a.x + self.slopes[1] * a.y;
+        let right = self.slopes[0] * b.x + self.slopes[1] * b.y;
+        self.springs[0] * (a.x * b.x)
+            + self.springs[1] * (a.y * b.y)
+            + Mat3A::from_cols(left * right.x, left * right.y, left * right.z)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -163,7 +231,12 @@ mod tests {
         Mesh::new(rest, vec![[0, 1, 2]]).unwrap()
     }
 
-    fn at(mesh: &Mesh, x: &[Vec3A]) -> (Vec<Vec3A>, Matrix) {
+    fn cloths() -> [Material; 2] {
+        let plain = Material::default();
+        [plain, Material { stretch: 300.0, weft: Some(1000.0), shear: 300.0, ..plain }]
+    }
+
+    fn at(mesh: &Mesh, x: &[Vec3A], material: &Material) -> (Vec<Vec3A>, Matrix) {
         let pattern = Pattern::new(mesh);
         let mut forces = vec![Vec3A::ZERO; 3];
         let mut matrix = Matrix {
@@ -171,7 +244,7 @@ mod tests {
             near: vec![Mat3A::ZERO; pattern.near.columns.len()],
             far: Vec::new(),
         };
-        let c = Constants::new(&Material::default());
+        let c = Constants::new(material);
         assemble(mesh, &pattern, c, 1.0, x, Sums { forces: &mut forces, matrix: &mut matrix });
         (forces, matrix)
     }
@@ -179,13 +252,13 @@ mod tests {
     #[test]
     fn the_hessian_is_the_slope_of_the_forces_where_it_is_positive() {
         // Stretched in both directions (no eigenvalue is cut off), once past the limit.
-        for grow in [1.03, 1.2] {
+        for (grow, material) in [(1.03, &cloths()[0]), (1.2, &cloths()[0]), (1.03, &cloths()[1])] {
             let mesh = triangle();
             let pattern = Pattern::new(&mesh);
             let turn = glam::Quat::from_rotation_x(0.7);
             let x: Vec<Vec3A> =
                 mesh.rest_positions().iter().map(|p| Vec3A::from(turn * (*p * grow))).collect();
-            let (_, matrix) = at(&mesh, &x);
+            let (_, matrix) = at(&mesh, &x, material);
             let step = 1e-3;
             for axis in 0..9 {
                 let mut d = vec![Vec3A::ZERO; 3];
@@ -193,7 +266,8 @@ mod tests {
                 let moved = |sign: f32| -> Vec<Vec3A> {
                     x.iter().zip(&d).map(|(x, d)| *x + *d * sign).collect()
                 };
-                let (f1, f0) = (at(&mesh, &moved(1.0)).0, at(&mesh, &moved(-1.0)).0);
+                let f1 = at(&mesh, &moved(1.0), material).0;
+                let f0 = at(&mesh, &moved(-1.0), material).0;
                 let mut predicted = vec![Vec3A::ZERO; 3];
                 matrix.multiply(&pattern, &d, &mut predicted);
                 for v in 0..3 {
@@ -206,12 +280,44 @@ mod tests {
     }
 
     #[test]
+    fn warp_weft_and_shear_answer_each_with_their_own_stiffness() {
+        let [_, material] = cloths();
+        let material = Material { shear: 40.0, ..material };
+        let rest = vec![Vec3::ZERO, Vec3::X, Vec3::X + Vec3::Y, Vec3::Y];
+        let mesh = Mesh::new(rest, vec![[0, 1, 2], [0, 2, 3]]).unwrap().with_grain(Vec3::X);
+        let strain = 1e-3f32;
+        // Force on the side x = 1 (or y = 1), along the given axis, of a square deformed so.
+        let force = |moved: fn(Vec3, f32) -> Vec3, side: [usize; 2], axis: usize| {
+            let x: Vec<Vec3A> =
+                mesh.rest_positions().iter().map(|p| moved(*p, strain).into()).collect();
+            let pattern = Pattern::new(&mesh);
+            let mut forces = vec![Vec3A::ZERO; 4];
+            let mut matrix = Matrix {
+                diagonal: vec![Mat3A::ZERO; 4],
+                near: vec![Mat3A::ZERO; pattern.near.columns.len()],
+                far: Vec::new(),
+            };
+            let sums = Sums { forces: &mut forces, matrix: &mut matrix };
+            assemble(&mesh, &pattern, Constants::new(&material), 1.0, &x, sums);
+            -(forces[side[0]] + forces[side[1]])[axis] / strain
+        };
+        let warp = force(|p, s| p + Vec3::X * (p.x * s), [1, 2], 0);
+        let weft = force(|p, s| p + Vec3::Y * (p.y * s), [2, 3], 1);
+        let shear = force(|p, s| p + Vec3::X * (p.y * s), [2, 3], 0);
+        for (found, wanted) in [(warp, 300.0), (weft, 1000.0), (shear, 40.0)] {
+            assert!((found / wanted - 1.0).abs() < 0.01, "{found} for {wanted}");
+        }
+    }
+
+    #[test]
     fn a_turned_or_shifted_triangle_feels_nothing() {
         let mesh = triangle();
         let turn = glam::Quat::from_rotation_z(2.0) * glam::Quat::from_rotation_x(1.0);
         let x: Vec<Vec3A> =
             mesh.rest_positions().iter().map(|p| Vec3A::from(turn * *p + Vec3::Y)).collect();
-        assert!(at(&mesh, &x).0.iter().all(|f| f.length() < 1e-3));
+        for material in cloths() {
+            assert!(at(&mesh, &x, &material).0.iter().all(|f| f.length() < 1e-3));
+        }
     }
 
     #[test]
@@ -224,8 +330,8 @@ mod tests {
             [Vec3A::ZERO, Vec3A::X * 0.2, Vec3A::Y * 0.1],
             [Vec3A::ZERO, Vec3A::X * -3.0, Vec3A::Z * 2.0],
         ];
-        for x in shapes {
-            let (forces, matrix) = at(&mesh, &x);
+        for (x, material) in shapes.iter().flat_map(|x| cloths().map(|m| (x, m))) {
+            let (forces, matrix) = at(&mesh, x, &material);
             assert!(forces.iter().all(|f| f.is_finite()));
             for i in 0..200 {
                 let part = |k: i32| ((i * 37 + k * 11) % 17) as f32 - 8.0;

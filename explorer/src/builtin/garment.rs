@@ -65,6 +65,7 @@ pub(super) fn robe(body: &Body) -> Result<Garment, BuiltinError> {
         fabric: Fabric {
             density: 0.18,
             stretch: 900.0,
+            weft: None,
             shear: 350.0,
             bend: 4e-5,
             friction: 0.3,

@@ -210,7 +210,11 @@ fn garment(scene: &Scene) -> Hasher {
         .floats(garment.positions.iter().flat_map(|v| v.to_array()))
         .integers(garment.triangles.iter().flatten().map(|i| u64::from(*i)))
         .integers(garment.attached.iter().map(|i| u64::from(*i)))
-        .floats([f.density, f.stretch, f.shear, f.bend, f.friction, f.drag, f.damping_s, f.offset])
+        .floats(
+            [f.density, f.stretch, f.shear, f.bend, f.friction, f.drag, f.damping_s, f.offset]
+                .into_iter()
+                .chain(f.weft),
+        )
 }
 
 #[cfg(test)]

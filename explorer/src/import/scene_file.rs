@@ -157,6 +157,7 @@ pub struct AttachTable {
 pub struct MaterialTable {
     density: Option<f32>,
     stretch: Option<f32>,
+    weft: Option<f32>,
     shear: Option<f32>,
     bend: Option<f32>,
     friction: Option<f32>,
@@ -300,6 +301,10 @@ impl GarmentTable {
         Ok(Fabric {
             density: field("density", m.density, default.density, [1e-3, 100.0])?,
             stretch: field("stretch", m.stretch, default.stretch, [1e-3, 1e7])?,
+            weft: match m.weft {
+                Some(weft) => Some(field("weft", m.weft, weft, [1e-3, 1e7])?),
+                None => default.weft,
+            },
             shear: field("shear", m.shear, default.shear, [0.0, 1e7])?,
             bend: field("bend", m.bend, default.bend, [0.0, 1.0])?,
             friction: field("friction", m.friction, default.friction, [0.0, 10.0])?,
