@@ -31,6 +31,8 @@ pub enum Command {
     Play(Play),
     /// Verify a store and say what is in it.
     Inspect(Inspect),
+    /// Simulate a garment along a walk, without a graph, and measure it.
+    Simulate(Simulate),
     /// Check a scene, draw it, or compute its motion graph.
     Scene(Scene),
 }
@@ -91,6 +93,9 @@ pub struct Explore {
     /// Simulation threads [default: all cores].
     #[arg(long)]
     pub workers: Option<usize>,
+    /// Vertices of the garment, exactly [default: as the scene says].
+    #[arg(long, value_name = "N")]
+    pub vertices: Option<usize>,
     /// The paper's plain algorithm: no early stop, no re-merging.
     #[arg(long)]
     pub paper: bool,
@@ -157,6 +162,41 @@ pub struct Inspect {
     /// Object store: a folder or a URL.
     #[arg(long, value_name = "URL|DIR")]
     pub store: String,
+    /// One JSON object on the last line of stdout.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `toile simulate`.
+#[derive(Debug, Args)]
+pub struct Simulate {
+    /// Built-in scene (`robe`, `dress`) or a scene file.
+    pub scene: String,
+    /// random:SEED, clip:A,B,... or edges:FILE. A walk through clips starts at the first of them.
+    #[arg(long, default_value = "random:1")]
+    pub walk: String,
+    /// Frames to simulate, at least 1.
+    #[arg(long, default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..))]
+    pub frames: u64,
+    /// Vertices of the garment, exactly [default: as the scene says].
+    #[arg(long, value_name = "N")]
+    pub vertices: Option<usize>,
+    /// Divide every step by this more than usual.
+    #[arg(long, default_value_t = 1, value_name = "K", visible_alias = "substeps",
+          value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub refine: u32,
+    /// Shift the drape by so many micrometres before the first frame.
+    #[arg(long, default_value_t = 0.0, value_name = "MICRONS", allow_negative_numbers = true)]
+    pub nudge: f32,
+    /// Write the measures of every frame as a table.
+    #[arg(long, value_name = "FILE.csv")]
+    pub table: Option<PathBuf>,
+    /// Write body and cloth as an animated glTF file.
+    #[arg(long, value_name = "FILE.glb")]
+    pub export: Option<PathBuf>,
+    /// Write a contact sheet.
+    #[arg(long, value_name = "FILE.png")]
+    pub picture: Option<PathBuf>,
     /// One JSON object on the last line of stdout.
     #[arg(long)]
     pub json: bool,

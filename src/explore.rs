@@ -20,7 +20,7 @@ pub fn run(a: args::Explore) -> Result<()> {
     if let Some(error) = a.error {
         ensure!(error.is_finite() && error >= 0.0, "--error {error}: millimetres, at least 0");
     }
-    let scene = scene::load(&a.scene)?;
+    let scene = scene::load_with(&a.scene, a.vertices)?;
     let opened = store::create_store(&a.store)?;
     let work = place::work(&opened, a.work)?;
     let stop = Stop::on_signals()?.after(a.time);
@@ -123,6 +123,10 @@ fn print(s: &Summary) {
         q.vertex_frames,
         q.pinched_vertex_frames,
         format::mm(q.depth_max_m)
+    );
+    println!(
+        "{} frames simulated again at a finer step, {} flagged",
+        q.frames_retried, q.frames_flagged
     );
     match s.end {
         End::Stopped => println!("stopped; the same command goes on from here"),

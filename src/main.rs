@@ -10,6 +10,7 @@ mod play;
 mod record;
 mod scene;
 mod serve;
+mod simulate;
 mod store;
 mod up;
 
@@ -27,6 +28,7 @@ fn main() -> ExitCode {
         Command::Serve(a) => serve::run(a),
         Command::Play(a) => play::run(&a),
         Command::Inspect(a) => inspect::run(&a),
+        Command::Simulate(a) => simulate::run(&a),
         Command::Scene(a) => scene::run(a),
     };
     match done {

@@ -1,4 +1,4 @@
-//! What `toile play` writes for people who look: an animated glTF file, a contact sheet.
+//! What `toile play` and `toile simulate` write for people who look: an animated glTF file, a contact sheet.
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
@@ -34,6 +34,31 @@ pub struct Recorder {
     joints: Vec<client_lib::Rigid>,
 }
 
+/// A frame as it is drawn.
+pub struct Shown<'a> {
+    /// The body in the world (m); empty where there is none.
+    pub body: Vec<Vec3>,
+    /// The cloth in the world (m).
+    pub cloth: &'a [Vec3],
+    /// Where the hips are (m).
+    pub hips: Vec3,
+    /// What stands under the picture.
+    pub caption: String,
+}
+
+/// What stays the same from frame to frame.
+#[derive(Clone, Copy)]
+pub struct Meshes<'a> {
+    /// Triangles of the body.
+    pub body: &'a [[u32; 3]],
+    /// Triangles of the cloth.
+    pub cloth: &'a [[u32; 3]],
+    /// Name of the garment.
+    pub garment: &'a str,
+    /// Frames per second.
+    pub fps: f32,
+}
+
 impl Recorder {
     /// Refuses files that could not be written, before anything is played.
     pub fn new(export: Option<PathBuf>, picture: Option<PathBuf>, frames: u64) -> Result<Self> {
@@ -53,10 +78,7 @@ impl Recorder {
     /// Takes a frame: the character, and its cloth in the world.
     pub fn frame(&mut self, character: &Character, cloth: &[Vec3]) -> Result<()> {
         let number = self.played;
-        self.played += 1;
-        let shots = SHOTS.min(self.frames);
-        let shoot = self.picture.is_some() && (number * shots) % self.frames < shots;
-        if !shoot && self.export.is_none() {
+        if !self.wants() {
             return Ok(());
         }
         let version = character.version();
@@ -64,47 +86,77 @@ impl Recorder {
         let mut body = Vec::new();
         if let Some(mesh) = version.scene().body() {
             mesh.skin(&pose, &mut self.joints, &mut body);
-            inset(&mut body, &mesh.triangles, cloth);
         }
-        if shoot {
-            let picture = shot(character, &body, cloth, pose.root)?;
-            self.sheet.push(picture, caption(character, number));
+        let caption = caption(character, number);
+        self.keep(&meshes(version), Shown { body, cloth, hips: pose.root, caption })
+    }
+
+    /// Counts a frame; whether [`Recorder::keep`] is to be called for it.
+    pub fn wants(&mut self) -> bool {
+        self.played += 1;
+        self.shoots() || self.export.is_some()
+    }
+
+    /// Whether the frame counted last is drawn.
+    fn shoots(&self) -> bool {
+        let (number, shots) = (self.played - 1, SHOTS.min(self.frames));
+        self.picture.is_some() && (number * shots) % self.frames < shots
+    }
+
+    /// Takes the frame counted last.
+    pub fn keep(&mut self, meshes: &Meshes<'_>, mut shown: Shown<'_>) -> Result<()> {
+        inset(&mut shown.body, meshes.body, shown.cloth);
+        if self.shoots() {
+            self.sheet.push(shot(meshes, &shown)?, shown.caption);
         }
         if self.export.is_some() {
-            self.body.push(body);
-            self.cloth.push(cloth.to_vec());
+            self.body.push(shown.body);
+            self.cloth.push(shown.cloth.to_vec());
         }
         Ok(())
     }
 
     /// Writes the files.
     pub fn finish(self, character: &Character) -> Result<()> {
+        let version = character.version();
+        let title = format!("{}, version {}", version.mesh().name, version.number());
+        self.write(&meshes(version), title)
+    }
+
+    /// Writes the files; the title stands above the contact sheet.
+    pub fn write(self, meshes: &Meshes<'_>, title: String) -> Result<()> {
         if let Some(file) = &self.picture {
-            let version = character.version();
-            let title = format!("{}, version {}", version.mesh().name, version.number());
             write(file, &self.sheet.titled(title).image()?.png()?)?;
         }
         let Some(file) = &self.export else { return Ok(()) };
-        let version = character.version();
-        let mut meshes = Vec::new();
-        if let Some(body) = version.scene().body() {
-            meshes.push(ClipMesh {
+        let mut clip = Vec::new();
+        if !meshes.body.is_empty() {
+            clip.push(ClipMesh {
                 name: "body",
-                triangles: &body.triangles,
+                triangles: meshes.body,
                 frames: &self.body,
                 colour: BODY,
                 two_sided: false,
             });
         }
-        meshes.push(ClipMesh {
-            name: &version.mesh().name,
-            triangles: &version.mesh().triangles,
+        clip.push(ClipMesh {
+            name: meshes.garment,
+            triangles: meshes.cloth,
             frames: &self.cloth,
             colour: CLOTH,
             two_sided: true,
         });
-        let clip = Clip { rate: version.scene().fps(), normals: true, meshes: &meshes };
+        let clip = Clip { rate: meshes.fps, normals: true, meshes: &clip };
         write(file, &picture::glb::glb(&clip)?)
+    }
+}
+
+fn meshes(version: &client_lib::version::Version) -> Meshes<'_> {
+    Meshes {
+        body: version.scene().body().map_or(&[], |body| &body.triangles),
+        cloth: &version.mesh().triangles,
+        garment: &version.mesh().name,
+        fps: version.scene().fps(),
     }
 }
 
@@ -125,21 +177,15 @@ fn inset(body: &mut [Vec3], triangles: &[[u32; 3]], cloth: &[Vec3]) {
     }
 }
 
-fn shot(
-    character: &Character,
-    body: &[Vec3],
-    cloth: &[Vec3],
-    hips: Vec3,
-) -> Result<picture::Image> {
-    let version = character.version();
+fn shot(meshes: &Meshes<'_>, shown: &Shown<'_>) -> Result<picture::Image> {
+    let layer = |positions, triangles, paint| Layer { positions, triangles, paint };
     let mut layers = Vec::new();
-    if let Some(mesh) = version.scene().body() {
-        let triangles = &mesh.triangles;
-        layers.push(Layer { positions: body, triangles, paint: Paint::BODY });
+    if !shown.body.is_empty() {
+        layers.push(layer(&shown.body, meshes.body, Paint::BODY));
     }
-    let triangles = &version.mesh().triangles;
-    layers.push(Layer { positions: cloth, triangles, paint: Paint::CLOTH });
+    layers.push(layer(shown.cloth, meshes.cloth, Paint::CLOTH));
     // The camera keeps its height while the character is on the ground, so that a jump shows.
+    let hips = shown.hips;
     let target = Vec3::new(hips.x, 0.85_f32.max(hips.y - 0.15), hips.z);
     let view = View::new(Camera::around(target, 4.4), 300, 380);
     Ok(picture::render(&view, &layers)?)

@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context, Result, ensure};
 use explorer::import::check::check_scene;
 use explorer::import::compute::Density;
-use explorer::import::{data_dir, load_scene, scene_graph};
+use explorer::import::{LoadOptions, data_dir, scene_graph};
 use explorer::scene::Scene;
 use glam::Vec3;
 use picture::{Camera, Layer, Paint, Sheet, View};
@@ -28,7 +28,13 @@ pub fn run(a: args::Scene) -> Result<()> {
 
 /// Loads a scene by name or file.
 pub fn load(name_or_file: &str) -> Result<Scene> {
-    Ok(load_scene(name_or_file, data_dir().as_deref())?)
+    load_with(name_or_file, None)
+}
+
+/// Loads a scene by name or file; `vertices` of its garment, where given.
+pub fn load_with(name_or_file: &str, vertices: Option<usize>) -> Result<Scene> {
+    let options = LoadOptions { vertices };
+    Ok(explorer::import::load_with(name_or_file, data_dir().as_deref(), options)?.scene)
 }
 
 /// The garment in the rest pose from four sides, then poses of every clip.

@@ -12,9 +12,8 @@ use protocol::EdgeId;
 use crate::grid::GridState;
 use crate::scene::Scene;
 use crate::simulator::{Frame, FrameQuality, SimulateError, Simulator, SimulatorFactory};
+use crate::watchdog::{self, Fault};
 
-/// Vertices deeper in the body are counted (m).
-pub const DEEP_M: f32 = 0.005;
 /// A vertex of the garment in the rest pose may be this deep in the body (m): it is led out.
 const REST_DEPTH_M: f32 = 0.001;
 
@@ -24,6 +23,8 @@ pub struct ClothSimulator {
     scene: Arc<Scene>,
     model: Arc<Model>,
     workspace: Workspace,
+    refine: u32,
+    nudge: Vec3,
 }
 
 /// Makes simulators that share one model.
@@ -57,6 +58,8 @@ impl ClothSimulatorFactory {
             scene: self.scene.clone(),
             model: self.model.clone(),
             workspace: Workspace::default(),
+            refine: 1,
+            nudge: Vec3::ZERO,
         }
     }
 }
@@ -81,8 +84,20 @@ impl ClothSimulator {
         &self.model
     }
 
+    /// Divides every step by `refine` (at least 1) more than usual.
+    pub fn set_refine(&mut self, refine: u32) {
+        self.refine = refine.max(1);
+    }
+
+    /// Shifts all vertices by so much in the world (m) before the next frame is simulated, to find
+    /// out how far chaos carries that. May be less than a step of the grid.
+    pub fn nudge_next(&mut self, by: Vec3) {
+        self.nudge = by;
+    }
+
     /// Moves the body from one pose to another in `seconds`; states are in the poses' hips
-    /// frames. What comes out not finite is tried again at half the step.
+    /// frames. What comes out of bounds is tried again at half the step, and at a quarter; what is
+    /// still out of bounds then is flagged, or an error where it cannot even be kept.
     fn advance(
         &mut self,
         state: &GridState,
@@ -94,19 +109,52 @@ impl ClothSimulator {
         let home =
             Rigid { translation: Vec3::new(-from.root.x, 0.0, -from.root.z), ..Rigid::IDENTITY };
         let (from, to) = (from.moved(&home), to.moved(&home));
-        let mut failed = String::new();
-        for refine in [1, 2, 4] {
+        let nudge = std::mem::take(&mut self.nudge);
+        let body_speed_m_s = self.body_speed(&from, &to, seconds);
+        let (mut failed, mut kept) = (String::new(), None);
+        let (mut substeps, mut iterations) = (0, 0);
+        for (attempt, finer) in watchdog::REFINE.into_iter().enumerate() {
             let mut world = to_world(state, &from.hips());
+            world.positions.iter_mut().for_each(|p| *p += nudge);
+            let refine = self.refine * finer;
             let span = Span { motion: Some((&from, &to)), seconds, refine };
-            match cloth::step(&self.model, &span, &mut world, &mut self.workspace) {
-                Ok(_) => match to_grid(&world, &to.hips()) {
-                    Ok(state) => return Ok(self.measured(state, &to)),
-                    Err(e) => failed = e.to_string(),
-                },
-                Err(e) => failed = e.to_string(),
+            let moved = match cloth::step(&self.model, &span, &mut world, &mut self.workspace) {
+                Ok(effort) => {
+                    substeps += u64::from(effort.substeps);
+                    iterations += u64::from(effort.iterations);
+                    to_grid(&world, &to.hips()).map_err(|e| e.to_string())
+                }
+                Err(e) => Err(e.to_string()),
+            };
+            let mut frame = match moved {
+                Ok(state) => self.measured(state, &to),
+                Err(why) => {
+                    failed = why;
+                    continue;
+                }
+            };
+            let fault = Fault::of(&frame.quality, body_speed_m_s);
+            frame.quality.frames_retried = u64::from(attempt > 0);
+            frame.quality.frames_flagged = u64::from(fault.is_some());
+            kept = Some(frame);
+            if fault.is_none() {
+                break;
             }
         }
-        Err(SimulateError(format!("the cloth left its bounds, also at a quarter step: {failed}")))
+        let text = || format!("the cloth left its bounds, also at a quarter step: {failed}");
+        let mut frame = kept.ok_or_else(|| SimulateError(text()))?;
+        (frame.quality.substeps, frame.quality.iterations) = (substeps, iterations);
+        Ok(frame)
+    }
+
+    /// Speed of the fastest vertex of the body between two poses (m/s), measured on the straight
+    /// way from one to the other.
+    fn body_speed(&self, from: &Pose, to: &Pose, seconds: f32) -> f32 {
+        let (mut joints, mut a, mut b) = (Vec::new(), Vec::new(), Vec::new());
+        self.scene.body.skin(from, &mut joints, &mut a);
+        self.scene.body.skin(to, &mut joints, &mut b);
+        let ways = a.iter().zip(&b).map(|(a, b)| a.distance_squared(*b));
+        ways.fold(0.0, f32::max).sqrt() / seconds
     }
 
     /// Measures a state as it will be kept: rounded.
@@ -116,15 +164,13 @@ impl ClothSimulator {
             frames: 1,
             vertex_frames: state.vertex_count() as u64,
             stretch_max: measure::stretch_max(self.model.mesh(), &world.positions),
+            speed_max_m_s: world.velocities.iter().map(|v| v.length()).fold(0.0, f32::max),
             ..FrameQuality::default()
         };
         if let Some(surface) = self.model.surface() {
             let offset = self.model.material().offset;
             let body = self.workspace.body();
-            let found = measure::penetration(surface, body, &world.positions, DEEP_M, offset);
-            quality.deep_vertex_frames = found.deep;
-            quality.pinched_vertex_frames = found.pinched;
-            quality.depth_max_m = found.depth_max_m;
+            watchdog::measure_depth(surface, body, &world.positions, offset, &mut quality);
         }
         Frame { state, quality }
     }

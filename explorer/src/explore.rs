@@ -128,6 +128,10 @@ pub struct Summary {
     pub version: u64,
     /// Jobs given up.
     pub failed_jobs: u64,
+    /// Frames that were simulated again at a finer step.
+    pub frames_retried: u64,
+    /// Frames that came out of bounds all the same.
+    pub frames_flagged: u64,
     /// Measures of all frames, the drape's included.
     pub quality: FrameQuality,
     /// Why it ended.
@@ -390,6 +394,8 @@ fn summary(work: &Work, end: End) -> Summary {
         simulate_cpu_s: work.simulate_cpu_s(),
         version: ledger.published().map_or(0, |last| last.number.0),
         failed_jobs: ledger.set_aside().len() as u64,
+        frames_retried: ledger.quality().frames_retried,
+        frames_flagged: ledger.quality().frames_flagged,
         quality: *ledger.quality(),
         end,
     }

@@ -2,12 +2,13 @@
 //!
 //! Wings: [`import`] reads scenes, characters, motion graphs and garments; [`builtin`] makes the
 //! built-in scene; [`grow`] explores (graph, metric, queue, jobs, journal); [`pack`] builds the
-//! basis, encodes and publishes; [`explore`] ties them together.
+//! basis, encodes and publishes; [`explore`] ties them together; [`simulate`] walks without a graph.
 //!
 //! Non-goals: who is connected (they meet in the store), what a region's bytes mean (`codec`).
 
 pub mod builtin;
 pub mod cloth_simulator;
+pub mod cpu;
 pub mod explore;
 pub mod grid;
 pub mod grow;
@@ -15,5 +16,7 @@ pub mod import;
 pub mod pack;
 pub mod primary;
 pub mod scene;
+pub mod simulate;
 pub mod simulator;
 pub mod view;
+pub mod watchdog;

@@ -38,14 +38,26 @@ pub struct FrameQuality {
     pub frames: u64,
     /// Vertices times frames measured.
     pub vertex_frames: u64,
+    /// Of these, deeper than 1 mm in the body and not held between two body parts.
+    pub inside_vertex_frames: u64,
     /// Of these, deeper than 5 mm in the body and not held between two body parts.
     pub deep_vertex_frames: u64,
-    /// Of these, deeper than 5 mm and held between two body parts.
+    /// Of these, deeper than 1 mm and held between two body parts.
     pub pinched_vertex_frames: u64,
     /// Deepest vertex that is not held between two body parts (m).
     pub depth_max_m: f32,
     /// Largest strain of an edge (0.1: 10 % longer than at rest).
     pub stretch_max: f32,
+    /// Fastest vertex (m/s).
+    pub speed_max_m_s: f32,
+    /// Substeps that were simulated, those of attempts that were given up included.
+    pub substeps: u64,
+    /// Iterations of conjugate gradients in them.
+    pub iterations: u64,
+    /// Frames that were simulated again at a finer step.
+    pub frames_retried: u64,
+    /// Frames that came out of bounds all the same: their states are flagged.
+    pub frames_flagged: u64,
 }
 
 impl FrameQuality {
@@ -53,10 +65,16 @@ impl FrameQuality {
     pub fn add(&mut self, other: &Self) {
         self.frames += other.frames;
         self.vertex_frames += other.vertex_frames;
+        self.inside_vertex_frames += other.inside_vertex_frames;
         self.deep_vertex_frames += other.deep_vertex_frames;
         self.pinched_vertex_frames += other.pinched_vertex_frames;
         self.depth_max_m = self.depth_max_m.max(other.depth_max_m);
         self.stretch_max = self.stretch_max.max(other.stretch_max);
+        self.speed_max_m_s = self.speed_max_m_s.max(other.speed_max_m_s);
+        self.substeps += other.substeps;
+        self.iterations += other.iterations;
+        self.frames_retried += other.frames_retried;
+        self.frames_flagged += other.frames_flagged;
     }
 }
 

@@ -7,6 +7,7 @@ use super::field::{RoundCone, Union, join};
 use super::remesh::{INSIDE, Target, remesh, settle};
 use super::surface::{Grid, Mesh, directed_edges, surface_nets};
 use super::{BuiltinError, check};
+use crate::import::refine::refine_to;
 use crate::scene::{Fabric, Garment};
 
 /// Least distance of the shell's field from the body's (m); triangles cut corners, so that the
@@ -14,6 +15,11 @@ use crate::scene::{Fabric, Garment};
 const EASE_M: f32 = 0.018;
 /// Length of the robe's edges (m): gives 3,000 to 3,400 vertices.
 const EDGE_M: f32 = 0.030;
+/// How many vertices that gives, a little above.
+const VERTICES_AT_EDGE: f32 = 3150.0;
+/// Fewest and most vertices that can be asked for: below, the openings close; above, the field's
+/// own rounding shows.
+const VERTICES: [usize; 2] = [1_500, 200_000];
 /// Fillet between the parts of the shell (m).
 const FILLET_M: f32 = 0.06;
 /// Height of the hem (m): at the calf.
@@ -41,21 +47,11 @@ const CUFF: [f32; 3] = [0.520, 1.015, -0.015];
 ///
 /// # Errors
 /// The mesh is no manifold with four openings.
-pub(super) fn robe(body: &Body) -> Result<Garment, BuiltinError> {
-    let shell = Shell::new();
-    let surface = |p: Vec3| shell.distance(p);
-    let grid =
-        Grid { low: Vec3::new(-0.80, 0.10, -0.46), high: Vec3::new(0.80, 1.85, 0.46), cell: 0.025 };
-    let mut mesh = surface_nets(&surface, grid);
-    let cuts: [&dyn Fn(Vec3) -> f32; 4] =
-        [&hem, &|p: Vec3| cuff(p), &|p: Vec3| cuff(p * Vec3::new(-1.0, 1.0, 1.0)), &face];
-    let mut cut_of = cut_open(&mut mesh, &cuts);
-    let target = Target { surface: &surface, cuts: &cuts, edge_m: EDGE_M, passes: 12 };
-    for (p, cut) in mesh.positions.iter_mut().zip(&cut_of) {
-        *p = settle(*p, *cut, &target);
-    }
-    remesh(&mut mesh, &mut cut_of, &target);
-    check(&mesh, "robe", 4)?;
+pub(super) fn robe(body: &Body, vertices: Option<usize>) -> Result<Garment, BuiltinError> {
+    let mesh = match vertices {
+        None => mesh(EDGE_M)?,
+        Some(vertices) => mesh_of(vertices)?,
+    };
     let attached = crown(&mesh, body);
     Ok(Garment {
         name: "robe".into(),
@@ -74,6 +70,42 @@ pub(super) fn robe(body: &Body) -> Result<Garment, BuiltinError> {
             offset: 0.004,
         },
     })
+}
+
+/// A mesh of a few vertices less, then the longest edges cut.
+fn mesh_of(vertices: usize) -> Result<Mesh, BuiltinError> {
+    let [least, most] = VERTICES;
+    let refused = BuiltinError::Vertices { asked: vertices, least, most };
+    if !(least..=most).contains(&vertices) {
+        return Err(refused);
+    }
+    let mut edge_m = EDGE_M * (VERTICES_AT_EDGE / vertices as f32).sqrt();
+    for _ in 0..8 {
+        let mut mesh = mesh(edge_m)?;
+        if refine_to(&mut mesh.positions, &mut mesh.triangles, vertices).is_ok() {
+            return Ok(mesh);
+        }
+        edge_m *= 1.02;
+    }
+    Err(refused)
+}
+
+fn mesh(edge_m: f32) -> Result<Mesh, BuiltinError> {
+    let shell = Shell::new();
+    let surface = |p: Vec3| shell.distance(p);
+    let grid =
+        Grid { low: Vec3::new(-0.80, 0.10, -0.46), high: Vec3::new(0.80, 1.85, 0.46), cell: 0.025 };
+    let mut mesh = surface_nets(&surface, grid);
+    let cuts: [&dyn Fn(Vec3) -> f32; 4] =
+        [&hem, &|p: Vec3| cuff(p), &|p: Vec3| cuff(p * Vec3::new(-1.0, 1.0, 1.0)), &face];
+    let mut cut_of = cut_open(&mut mesh, &cuts);
+    let target = Target { surface: &surface, cuts: &cuts, edge_m, passes: 12 };
+    for (p, cut) in mesh.positions.iter_mut().zip(&cut_of) {
+        *p = settle(*p, *cut, &target);
+    }
+    remesh(&mut mesh, &mut cut_of, &target);
+    check(&mesh, "robe", 4)?;
+    Ok(mesh)
 }
 
 /// The closed surface from which the robe is cut.

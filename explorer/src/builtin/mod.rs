@@ -51,22 +51,33 @@ pub enum BuiltinError {
         /// How many there shall be.
         wanted: usize,
     },
+    /// A number of vertices for which no robe can be made.
+    #[error("a robe of {asked} vertices cannot be made; ask for {least} to {most}")]
+    Vertices {
+        /// As asked for.
+        asked: usize,
+        /// The fewest.
+        least: usize,
+        /// The most.
+        most: usize,
+    },
     /// Clips and transitions do not form a primary graph.
     #[error("the built-in motion graph does not hold together: {0}; please report it")]
     Primary(#[from] PrimaryError),
 }
 
 /// The built-in scene: a character of 1.7 m that walks, runs, turns, jumps, kicks and spins in a
-/// hooded robe of about 3,100 vertices.
+/// hooded robe of about 3,100 vertices, or of exactly `vertices`.
 ///
 /// Meshes are in the rest pose (m), y up, facing +z. The garment starts from the first frame of
 /// the walk. Cost: under a second.
 ///
 /// # Errors
-/// Only if a change to this module broke it.
-pub fn robe() -> Result<Scene, BuiltinError> {
+/// A number of vertices for which no robe can be made; else only if a change to this module broke
+/// it.
+pub fn robe(vertices: Option<usize>) -> Result<Scene, BuiltinError> {
     let body = character::body()?;
-    let garment = garment::robe(&body)?;
+    let garment = garment::robe(&body, vertices)?;
     let cycles = clips::clips(&body.skeleton);
     let primary = graph::primary_graph(&body.skeleton, &cycles)?;
     Ok(Scene {

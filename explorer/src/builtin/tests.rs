@@ -17,7 +17,7 @@ const JOINT_JERK_MAX_M_S: f32 = 7.0;
 
 fn scene() -> &'static Scene {
     static SCENE: std::sync::OnceLock<Scene> = std::sync::OnceLock::new();
-    SCENE.get_or_init(|| robe().unwrap())
+    SCENE.get_or_init(|| robe(None).unwrap())
 }
 
 fn body_mesh() -> Mesh {
@@ -225,7 +225,7 @@ fn two_builds_are_equal_bit_for_bit() {
         }
         hash.finalize()
     };
-    let again = robe().unwrap();
+    let again = robe(None).unwrap();
     assert_eq!(digest(scene()), digest(&again));
     assert_eq!(scene().garment, again.garment);
     assert_eq!(scene().primary, again.primary);

@@ -7,7 +7,7 @@ use crate::scene::Scene;
 use crate::simulator::FrameQuality;
 
 /// Version of the journal's records and of the state file.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 
 /// One record of the journal.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use super::job::{self, Context, JobError, Outcome};
 use super::ledger::{Job, Phase};
 use super::work::{Work, WorkError};
+use crate::cpu::CpuClock;
 use crate::simulator::Simulator;
 
 /// How often a running round looks whether it is to stop.
@@ -171,29 +172,4 @@ fn give_up(work: &mut Work, error: JobError) -> Result<Option<JobError>, RoundEr
             Ok(Some(error))
         }
     }
-}
-
-/// CPU time of this thread where the system tells it, else time passed.
-struct CpuClock {
-    started: Instant,
-    cpu_ns: Option<u64>,
-}
-
-impl CpuClock {
-    fn start() -> Self {
-        Self { started: Instant::now(), cpu_ns: thread_cpu_ns() }
-    }
-
-    fn elapsed_s(&self) -> f64 {
-        match (self.cpu_ns, thread_cpu_ns()) {
-            (Some(before), Some(now)) => now.saturating_sub(before) as f64 * 1e-9,
-            _ => self.started.elapsed().as_secs_f64(),
-        }
-    }
-}
-
-/// Linux tells the nanoseconds that a thread spent on a CPU in the first field of this file.
-fn thread_cpu_ns() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
-    text.split_whitespace().next()?.parse().ok().filter(|ns| *ns > 0)
 }

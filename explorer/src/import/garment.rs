@@ -9,7 +9,7 @@ use protocol::limits::{TRIANGLES_MAX, VERTICES_MAX};
 use super::character::{self, CharacterError};
 use super::gltf_file::Document;
 use super::obj;
-use super::refine::{TooFine, refine};
+use super::refine::{TooFine, refine, refine_to};
 
 /// A triangle mesh as read.
 #[derive(Debug, Clone, PartialEq)]
@@ -73,6 +73,14 @@ pub enum GarmentError {
     Refine {
         /// As asked for (m).
         edge_length_m: f32,
+        /// What is wrong.
+        problem: String,
+    },
+    /// A number of vertices.
+    #[error("{vertices} vertices: {problem}")]
+    Vertices {
+        /// As asked for.
+        vertices: usize,
         /// What is wrong.
         problem: String,
     },
@@ -160,6 +168,19 @@ impl Surface {
         }
         refine(&mut self.positions, &mut self.triangles, edge_length_m, VERTICES_MAX)
             .map_err(|e: TooFine| error(e.to_string()))
+    }
+
+    /// Cuts edges, the longest first, until there are exactly so many vertices.
+    ///
+    /// # Errors
+    /// The surface has more vertices already, or the number is over a limit.
+    pub fn refine_to(&mut self, vertices: usize) -> Result<(), GarmentError> {
+        let error = |problem: String| GarmentError::Vertices { vertices, problem };
+        if vertices > VERTICES_MAX {
+            return Err(error(format!("at most {VERTICES_MAX} are allowed")));
+        }
+        refine_to(&mut self.positions, &mut self.triangles, vertices)
+            .map_err(|e| error(e.to_string()))
     }
 
     /// Boundary loops as vertex lists, in order of their smallest vertex.

@@ -139,12 +139,31 @@ pub fn load_scene(name_or_path: &str, data_dir: Option<&Path>) -> Result<Scene, 
 /// # Errors
 /// As for [`load_scene`].
 pub fn load(name_or_path: &str, data_dir: Option<&Path>) -> Result<Loaded, SceneError> {
+    load_with(name_or_path, data_dir, LoadOptions::default())
+}
+
+/// What the caller wants otherwise than the scene says.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct LoadOptions {
+    /// Vertices of the garment, exactly.
+    pub vertices: Option<usize>,
+}
+
+/// As [`load`], with changes.
+///
+/// # Errors
+/// As for [`load_scene`]; also fewer vertices than the garment's file has.
+pub fn load_with(
+    name_or_path: &str,
+    data_dir: Option<&Path>,
+    options: LoadOptions,
+) -> Result<Loaded, SceneError> {
     if name_or_path == "robe" {
-        let scene = crate::builtin::robe()?;
+        let scene = crate::builtin::robe(options.vertices)?;
         return Ok(Loaded { scene, graph: None });
     }
     let (text, path) = scene_text(name_or_path)?;
-    load_text(&text, &path, data_dir)
+    load_text_with(&text, &path, data_dir, options)
 }
 
 /// The data folder: the environment's `TOILE_DATA`, else the first `shared/data` beside the
@@ -229,12 +248,21 @@ fn load_character(file: &SceneFile, place: &Place<'_>) -> Result<Character, Scen
 /// # Errors
 /// As for [`load_scene`].
 pub fn load_text(text: &str, path: &Path, data_dir: Option<&Path>) -> Result<Loaded, SceneError> {
+    load_text_with(text, path, data_dir, LoadOptions::default())
+}
+
+fn load_text_with(
+    text: &str,
+    path: &Path,
+    data_dir: Option<&Path>,
+    options: LoadOptions,
+) -> Result<Loaded, SceneError> {
     let place = Place { scene: path, data: data_dir };
     let file = SceneFile::parse(text).map_err(|e| place.error(e))?;
     let character = load_character(&file, &place)?;
     let (primary, graph) = load_primary(&file, &character, &place)?;
     let start = start_pose(&file, &primary).map_err(|e| place.error(e))?;
-    let garment = load_garment(&file, &character, &place)?;
+    let garment = load_garment(&file, &character, &place, options)?;
     let scene = Scene {
         name: file.name.clone(),
         body: Arc::new(character.body),
@@ -332,6 +360,7 @@ fn load_garment(
     file: &SceneFile,
     character: &Character,
     place: &Place<'_>,
+    options: LoadOptions,
 ) -> Result<Garment, SceneError> {
     let table = file.garment().map_err(|e| place.error(e))?;
     let path = place.resolve("garment.file", &table.file)?;
@@ -341,7 +370,9 @@ fn load_garment(
         let mut surface = Surface::read(&path, &bytes)?;
         check::check_mesh(&surface.positions, &surface.triangles)?;
         let file_vertices = surface.positions.len();
-        if let Some(edge_length_m) = table.edge_length_m {
+        if let Some(vertices) = options.vertices.or(table.vertices) {
+            surface.refine_to(vertices)?;
+        } else if let Some(edge_length_m) = table.edge_length_m {
             surface.refine(edge_length_m)?;
         }
         let skeleton = &character.body.skeleton;

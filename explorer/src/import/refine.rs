@@ -16,6 +16,14 @@ pub struct TooFine {
     pub vertices_max: usize,
 }
 
+/// A mesh cannot be made coarser.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the mesh has {has} vertices, and it can only be made finer; ask for at least as many")]
+pub struct TooCoarse {
+    /// Vertices it has.
+    pub has: usize,
+}
+
 /// Cuts edges until none is longer than `edge_length_m`; old vertices keep their index.
 ///
 /// Cost: O(n log n) in the number of new triangles. The mesh must be manifold.
@@ -36,6 +44,27 @@ pub fn refine(
         if mesh.positions.len() >= vertices_max {
             return Err(TooFine { vertices_max });
         }
+        mesh.cut(edge);
+    }
+    Ok(())
+}
+
+/// Cuts the longest edge again and again until there are exactly `vertices`; old vertices keep
+/// their index, and a finer mesh begins with the vertices of every coarser one.
+///
+/// # Errors
+/// The mesh has more vertices already.
+pub fn refine_to(
+    positions: &mut Vec<Vec3>,
+    triangles: &mut Vec<[u32; 3]>,
+    vertices: usize,
+) -> Result<(), TooCoarse> {
+    if positions.len() > vertices {
+        return Err(TooCoarse { has: positions.len() });
+    }
+    let mut mesh = Mesh::new(positions, triangles, 0.0);
+    while mesh.positions.len() < vertices {
+        let Some(edge) = mesh.longest() else { break };
         mesh.cut(edge);
     }
     Ok(())
@@ -163,6 +192,22 @@ mod tests {
         assert!(count.values().all(|c| *c <= 2));
         // Euler: a disc.
         assert_eq!(positions.len() + triangles.len(), count.len() + 1);
+    }
+
+    #[test]
+    fn any_number_of_vertices_is_met_and_finer_meshes_begin_with_coarser_ones() {
+        let start = (vec![Vec3::ZERO, Vec3::X, Vec3::Y], vec![[0, 1, 2]]);
+        let made = |vertices| {
+            let (mut positions, mut triangles) = start.clone();
+            refine_to(&mut positions, &mut triangles, vertices).map(|()| (positions, triangles))
+        };
+        let (fine, triangles) = made(517).unwrap();
+        assert_eq!(fine.len(), 517);
+        let (coarse, _) = made(90).unwrap();
+        assert_eq!(coarse, fine[..90]);
+        let sum: f32 = triangles.iter().map(|t| area(&fine, *t).z).sum();
+        assert!((sum - 0.5).abs() < 1e-5, "{sum}");
+        assert_eq!(made(2).unwrap_err(), TooCoarse { has: 3 });
     }
 
     #[test]

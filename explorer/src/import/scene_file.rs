@@ -15,7 +15,7 @@
 //! [garment]
 //! file = "$TOILE_DATA/garments/dress_long.obj"
 //! name = "dress"                               # default: the scene's name
-//! edge_length_m = 0.03                         # default: as the file is
+//! edge_length_m = 0.03                         # or vertices = 10000; default: as the file is
 //! attach = [{ loop_near = "Neck" }]            # or near + within_m, or vertices
 //!
 //! [garment.material]                           # SI; each has a default
@@ -129,6 +129,8 @@ pub struct GarmentTable {
     pub name: Option<String>,
     /// Longest edge after refinement (m).
     pub edge_length_m: Option<f32>,
+    /// Number of vertices after refinement, exactly; in place of `edge_length_m`.
+    pub vertices: Option<usize>,
     /// What is held to the body.
     #[serde(default)]
     pub attach: Vec<AttachTable>,
@@ -228,6 +230,9 @@ impl SceneFile {
             .try_into()
             .map_err(|e: toml::de::Error| value("[garment]", e.to_string().trim_end()))?;
         garment.fabric()?;
+        if garment.vertices.is_some() && garment.edge_length_m.is_some() {
+            return Err(value("garment", "give edge_length_m or vertices, not both"));
+        }
         garment.attachments()?;
         Ok(garment)
     }

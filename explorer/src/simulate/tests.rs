@@ -1,0 +1,47 @@
+//! Straight simulation of the built-in robe.
+
+use super::*;
+
+#[test]
+fn a_walk_is_measured_and_continuous_in_the_world() {
+    let mut scene = crate::builtin::robe(Some(1600)).unwrap();
+    scene.exploration.drape_frames = 5;
+    let mut walk = Straight::new(&scene, Options::default()).unwrap();
+    let start = walk.again(Options::default()).unwrap();
+    let mut tally = Tally::default();
+    for frame in 0..6 {
+        let before = walk.world();
+        // The last edge leads into a transition where there is one.
+        let edge = scene.primary.out_edges(walk.pose()).next_back().unwrap();
+        let step = walk.step(scene.primary.edge(edge).to).unwrap();
+        tally.add(&step, &walk);
+        let ways = before.iter().zip(walk.world()).map(|(a, b)| a.distance(b));
+        let longest = ways.fold(0.0, f32::max);
+        // At no more than twice the speed at its end; the grid's steps apart.
+        assert!(longest < 2.0 * step.quality.speed_max_m_s / 30.0 + 0.05, "{frame}: {longest}");
+    }
+    let sum = tally.sum();
+    assert_eq!((sum.frames, tally.quality().vertex_frames), (6, 6 * 1600));
+    assert!(sum.cpu_s_median > 0.0 && sum.cpu_s_max >= sum.cpu_s_p99, "{sum:?}");
+    assert!(sum.stretch_p99_pct < 15.0 && sum.substeps_mean >= 4.0, "{sum:?}");
+    // Again, and again with the start moved: only the latter differs.
+    let step = |options| {
+        let mut walk = start.again(options).unwrap();
+        let edge = scene.primary.out_edges(walk.pose()).next_back().unwrap();
+        walk.step(scene.primary.edge(edge).to).unwrap();
+        walk.state().clone()
+    };
+    let first = step(Options::default());
+    assert_eq!(first, step(Options::default()));
+    assert_ne!(first, step(Options { nudge_m: 1e-6, ..Options::default() }));
+    assert_ne!(first, step(Options { refine: 2, ..Options::default() }));
+}
+
+#[test]
+fn a_pose_that_does_not_follow_is_refused() {
+    let mut scene = crate::builtin::robe(Some(1600)).unwrap();
+    scene.exploration.drape_frames = 1;
+    let mut walk = Straight::new(&scene, Options::default()).unwrap();
+    let error = walk.step(scene.start).unwrap_err();
+    assert!(error.0.contains("no edge"), "{error}");
+}

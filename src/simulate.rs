@@ -1,0 +1,213 @@
+//! `toile simulate`: a garment along a walk, simulated frame after frame.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context, Result, bail, ensure};
+use client_lib::{Walk, WalkSpec};
+use explorer::pack::scene_chunk::scene_chunk;
+use explorer::scene::Scene;
+use explorer::simulate::{Options, Step, Straight, Sum, Tally};
+use serde::Serialize;
+
+use crate::explore::Stop;
+use crate::live::Live;
+use crate::record::{Meshes, Recorder, Shown};
+use crate::{args, format, place, scene};
+
+/// What is printed with `--json`.
+#[derive(Debug, Serialize)]
+struct Summary<'a> {
+    scene: &'a str,
+    garment: &'a str,
+    vertices: usize,
+    walk: &'a str,
+    refine: u32,
+    nudge_microns: f32,
+    /// Frames at which the walk was to end.
+    frames_asked: u64,
+    #[serde(flatten)]
+    sum: Sum,
+}
+
+/// Simulates a walk and prints what was measured.
+pub fn run(a: &args::Simulate) -> Result<()> {
+    let spec = WalkSpec::parse(&a.walk)?;
+    ensure!(a.nudge.is_finite(), "--nudge {}: micrometres, a number", a.nudge);
+    let mut recorder = Recorder::new(a.export.clone(), a.picture.clone(), a.frames)?;
+    let mut table = a.table.clone().map(Table::new).transpose()?;
+    let mut scene = scene::load_with(&a.scene, a.vertices)?;
+    start_at_clip(&mut scene, &spec);
+    let scene = &scene;
+    let mut walk = walk(scene, &spec)?;
+    let stop = Stop::on_signals()?;
+    let mut live = Live::new(Some(a.frames));
+    live.tell(0, || "draping the garment".into());
+    let options = Options { refine: a.refine, nudge_m: a.nudge * 1e-6 };
+    let mut straight = Straight::new(scene, options)?;
+    let mut tally = Tally::default();
+    for frame in 0..a.frames {
+        let Some(next) = walk.next().filter(|_| !stop.is_asked()) else {
+            live.note(&format!("the walk ends after {frame} of {} frames", a.frames));
+            break;
+        };
+        let step = straight.step(next)?;
+        tally.add(&step, &straight);
+        record(&mut recorder, &straight, scene, &step)?;
+        if let Some(table) = &mut table {
+            table.row(frame, &name(&straight, scene), &step)?;
+        }
+        live.tell(frame + 1, || line(&tally.sum()));
+    }
+    live.done();
+    let sum = tally.sum();
+    let vertices = scene.garment.positions.len();
+    let garment = &scene.garment.name;
+    recorder.write(&meshes(scene), format!("{garment}, {vertices} vertices, {}", a.walk))?;
+    if let Some(table) = table {
+        table.write()?;
+    }
+    if sum.frames == 0 {
+        bail!("not one frame was simulated");
+    }
+    if !a.json {
+        print(garment, vertices, &sum);
+        return Ok(());
+    }
+    format::print_json(&Summary {
+        scene: &scene.name,
+        garment,
+        vertices,
+        walk: &a.walk,
+        refine: a.refine,
+        nudge_microns: a.nudge,
+        frames_asked: a.frames,
+        sum,
+    })
+}
+
+/// A walk through clips starts at the first one's first pose, so that its frames are not spent on
+/// the way there.
+fn start_at_clip(scene: &mut Scene, spec: &WalkSpec) {
+    let WalkSpec::Clips(names) = spec else { return };
+    let primary = Arc::clone(&scene.primary);
+    let clip = primary.clips().iter().position(|clip| Some(clip) == names.first());
+    let poses = primary.poses().iter().enumerate();
+    let of_clip = poses.filter(|(_, p)| !p.transition && Some(usize::from(p.clip)) == clip);
+    if let Some((first, _)) = of_clip.min_by_key(|(_, pose)| pose.frame) {
+        let ids = primary.edges().iter().flat_map(|e| [e.from, e.to]);
+        scene.start = ids.into_iter().find(|id| id.index() == first).unwrap_or(scene.start);
+    }
+}
+
+/// The walk that `toile play` would take from the scene's start.
+fn walk(scene: &Scene, spec: &WalkSpec) -> Result<Walk> {
+    let walked = Arc::new(client_lib::Scene::new(scene_chunk(scene))?);
+    Ok(Walk::new(spec, &walked, scene.start)?)
+}
+
+fn record(
+    recorder: &mut Recorder,
+    straight: &Straight<'_>,
+    scene: &Scene,
+    step: &Step,
+) -> Result<()> {
+    if !recorder.wants() {
+        return Ok(());
+    }
+    let pose = straight.world_pose();
+    let (mut joints, mut body) = (Vec::new(), Vec::new());
+    scene.body.skin(&pose, &mut joints, &mut body);
+    let flag = if step.quality.frames_flagged > 0 { " FLAGGED" } else { "" };
+    let caption = format!("{}{flag}", name(straight, scene));
+    let cloth = straight.world();
+    recorder.keep(&meshes(scene), Shown { body, cloth: &cloth, hips: pose.root, caption })
+}
+
+/// Clip and frame where a walk stands; `>` before a transition.
+fn name(straight: &Straight<'_>, scene: &Scene) -> String {
+    let pose = scene.primary.pose(straight.pose());
+    let arrow = if pose.transition { "> " } else { "" };
+    format!("{arrow}{} {}", scene.primary.clips()[usize::from(pose.clip)], pose.frame)
+}
+
+fn meshes(scene: &Scene) -> Meshes<'_> {
+    Meshes {
+        body: &scene.body.triangles,
+        cloth: &scene.garment.triangles,
+        garment: &scene.garment.name,
+        fps: scene.primary.fps(),
+    }
+}
+
+fn line(sum: &Sum) -> String {
+    format!(
+        "{:.3} CPU s a frame, p99 {:.3}; stretch p99 {:.1} %, max {:.1} %; {} retried, {} flagged",
+        sum.cpu_s_median,
+        sum.cpu_s_p99,
+        sum.stretch_p99_pct,
+        sum.stretch_max_pct,
+        sum.frames_retried,
+        sum.frames_flagged
+    )
+}
+
+fn print(garment: &str, vertices: usize, s: &Sum) {
+    println!("{garment}, {vertices} vertices: {} frames in {:.1} CPU s", s.frames, s.cpu_s);
+    println!(
+        "CPU s a frame: median {:.3}, p90 {:.3}, p99 {:.3}, max {:.3}; {:.1} substeps, {:.0} \
+         iterations",
+        s.cpu_s_median, s.cpu_s_p90, s.cpu_s_p99, s.cpu_s_max, s.substeps_mean, s.iterations_mean
+    );
+    println!("stretch: p99 {:.2} %, max {:.2} %", s.stretch_p99_pct, s.stretch_max_pct);
+    println!(
+        "in the body: {:.2e} of the vertex-frames deeper than 1 mm, {:.2e} deeper than 5 mm \
+         ({:.2e} more pinched); deepest {:.1} mm",
+        s.deep_1mm_share, s.deep_5mm_share, s.pinched_share, s.depth_max_mm
+    );
+    println!(
+        "fastest vertex {:.1} m/s; {} frames retried, {} flagged",
+        s.speed_max_m_s, s.frames_retried, s.frames_flagged
+    );
+}
+
+/// The measures of every frame, for a spreadsheet.
+struct Table {
+    file: PathBuf,
+    text: String,
+}
+
+impl Table {
+    fn new(file: PathBuf) -> Result<Self> {
+        place::ensure_writable(&file)?;
+        let text = "frame,pose,cpu_s,substeps,iterations,deep_1mm,deep_5mm,pinched,depth_max_mm,\
+                    stretch_max_pct,speed_max_m_s,retried,flagged\n";
+        Ok(Self { file, text: text.into() })
+    }
+
+    fn row(&mut self, frame: u64, name: &str, step: &Step) -> Result<()> {
+        let q = &step.quality;
+        writeln!(
+            self.text,
+            "{frame},{name},{:.6},{},{},{},{},{},{:.3},{:.3},{:.3},{},{}",
+            step.cpu_s,
+            q.substeps,
+            q.iterations,
+            q.inside_vertex_frames,
+            q.deep_vertex_frames,
+            q.pinched_vertex_frames,
+            q.depth_max_m * 1e3,
+            q.stretch_max * 100.0,
+            q.speed_max_m_s,
+            q.frames_retried,
+            q.frames_flagged
+        )?;
+        Ok(())
+    }
+
+    fn write(self) -> Result<()> {
+        let at = |file: &Path| format!("writing {}", file.display());
+        std::fs::write(&self.file, self.text).with_context(|| at(&self.file))
+    }
+}
