@@ -1,9 +1,12 @@
 //! `toile`: one binary for everything. This file parses and dispatches; each command has a module.
 
 mod args;
+mod clock;
 mod explore;
 mod format;
 mod inspect;
+mod lab;
+mod lab_record;
 mod live;
 mod place;
 mod play;
@@ -30,6 +33,7 @@ fn main() -> ExitCode {
         Command::Inspect(a) => inspect::run(&a),
         Command::Simulate(a) => simulate::run(&a),
         Command::Scene(a) => scene::run(a),
+        Command::Lab(a) => lab::run(a),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

@@ -12,10 +12,13 @@
 //! Map: [`rigid`] rigid transforms; [`body`] skeleton, poses, skinning; [`mesh`] garment
 //! topology; [`material`] physical constants; [`model`] what does not change during a run;
 //! [`solver`] the step; [`surface`], [`bvh`], [`triangle`] closest points of a moving surface;
-//! [`measure`] strain, penetration, clearance.
+//! [`measure`] strain, penetration, clearance; [`fabrics`] measured fabrics by name; [`lab`] the test
+//! bench.
 
 pub mod body;
 pub mod bvh;
+pub mod fabrics;
+pub mod lab;
 pub mod material;
 pub mod measure;
 pub mod mesh;

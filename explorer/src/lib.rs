@@ -20,3 +20,6 @@ pub mod simulate;
 pub mod simulator;
 pub mod view;
 pub mod watchdog;
+
+/// The simulation kernel: its test bench and its fabrics are for the command line too.
+pub use cloth;

@@ -1,0 +1,318 @@
+//! Where benches run: steps that are timed, shown and measured.
+
+use glam::Vec3;
+
+use super::hits;
+use super::{LabError, Limit, Row};
+use crate::body::Pose;
+use crate::fabrics::Fabric;
+use crate::material::Material;
+use crate::measure;
+use crate::model::{Model, State};
+use crate::solver::{Effort, SUBSTEP_S_MAX, Span, Workspace, step};
+
+/// What a caller may set.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Settings {
+    /// Size of the mesh, as the bench understands it: vertices a side, edges a length.
+    pub n: Option<u32>,
+    /// Number of vertices, about; wins over `n` where a bench takes it.
+    pub vertices: Option<u32>,
+    /// Fabric instead of the bench's own material.
+    pub fabric: Option<&'static Fabric>,
+    /// Longest substep (s); the solver's own is the longest possible.
+    pub dt_s: Option<f32>,
+    /// Fewer cases, for tests that run every time.
+    pub quick: bool,
+}
+
+impl Settings {
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// Names the first parameter that is out of range.
+    pub fn check(&self) -> Result<(), LabError> {
+        let given = [
+            ("n", self.n.map(f64::from), 2.0, 400.0),
+            ("vertices", self.vertices.map(f64::from), 4.0, 160_000.0),
+            ("dt", self.dt_s.map(f64::from), 1e-5, 1.0 / 30.0),
+        ];
+        for (name, value, least, most) in given {
+            if let Some(value) = value
+                && !(value >= least && value <= most + 1e-9)
+            {
+                return Err(LabError::Parameter { name, value, least, most });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A frame, as the caller may draw it.
+#[derive(Debug, Clone, Copy)]
+pub struct Shot<'a> {
+    /// Which run of the bench: a bench that compares makes several.
+    pub run: u32,
+    /// Time since the run's beginning (s).
+    pub time_s: f32,
+    /// The cloth (m).
+    pub positions: &'a [Vec3],
+    /// Its triangles.
+    pub triangles: &'a [[u32; 3]],
+    /// What it lies on, if anything: vertices (m) and triangles.
+    pub body: Option<(&'a [Vec3], &'a [[u32; 3]])>,
+}
+
+/// What the stage measures in every bench.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tally {
+    /// Vertices of the largest run.
+    pub vertices: usize,
+    /// Frames of all runs.
+    pub frames: u64,
+    /// Simulated time (s).
+    pub simulated_s: f64,
+    /// Processor time spent in steps (s), without the first frame of each run.
+    pub cpu_s: f64,
+    /// Simulated time to which that belongs (s).
+    pub timed_s: f64,
+    /// Substeps.
+    pub substeps: u64,
+    /// Iterations of the linear solver.
+    pub iterations: u64,
+    /// Edge strain below which 99 % lie; largest of all frames unless the bench says otherwise.
+    pub stretch_p99: f32,
+    /// Largest edge strain.
+    pub stretch_max: f32,
+    /// Deepest vertex in the body (m).
+    pub penetration_m: f32,
+    /// Edges that cut a triangle: most in any frame looked at.
+    pub self_hits: u64,
+    /// Lowest vertex of all frames (m).
+    pub lowest_m: f32,
+    /// Fastest vertex (m/s).
+    pub speed_max_m_s: f32,
+}
+
+impl Default for Tally {
+    fn default() -> Self {
+        Self {
+            vertices: 0,
+            frames: 0,
+            simulated_s: 0.0,
+            cpu_s: 0.0,
+            timed_s: 0.0,
+            substeps: 0,
+            iterations: 0,
+            stretch_p99: 0.0,
+            stretch_max: 0.0,
+            penetration_m: 0.0,
+            self_hits: 0,
+            lowest_m: f32::INFINITY,
+            speed_max_m_s: 0.0,
+        }
+    }
+}
+
+impl Tally {
+    /// Processor time (ms) per 1/60 s of simulated time.
+    pub fn cpu_ms_per_frame(&self) -> f64 {
+        if self.timed_s > 0.0 { 1e3 * self.cpu_s / (60.0 * self.timed_s) } else { 0.0 }
+    }
+}
+
+/// A cloth on the stage.
+pub struct Sim {
+    /// What does not change.
+    pub model: Model,
+    /// What does.
+    pub state: State,
+    /// Length of a frame (s).
+    pub frame_s: f32,
+    /// Longest substep asked for (s).
+    pub dt_s: f32,
+    /// What the last frame took.
+    pub effort: Effort,
+    /// Time since the beginning (s).
+    pub time_s: f32,
+    /// Crossings are counted in every frame whose number is a multiple; 0: never.
+    pub hits_every: u64,
+    frames: u64,
+    run: u32,
+    workspace: Workspace,
+}
+
+impl Sim {
+    /// Frames so far.
+    pub fn frames(&self) -> u64 {
+        self.frames
+    }
+
+    /// Length of the last substep (s).
+    pub fn substep_s(&self) -> f32 {
+        self.frame_s / self.effort.substeps.max(1) as f32
+    }
+
+    /// Vertices of the body where the last step left it (m).
+    pub fn body(&self) -> &[Vec3] {
+        &self.workspace.body().positions
+    }
+}
+
+/// Where a bench runs.
+pub struct Stage<'a> {
+    /// What the caller set.
+    pub settings: Settings,
+    /// What was measured so far; a bench may correct it.
+    pub tally: Tally,
+    clock: &'a mut dyn FnMut() -> f64,
+    watch: &'a mut dyn FnMut(&Shot<'_>) -> bool,
+    rows: Vec<Row>,
+    runs: u32,
+}
+
+impl<'a> Stage<'a> {
+    /// An empty stage.
+    pub fn new(
+        settings: Settings,
+        clock: &'a mut dyn FnMut() -> f64,
+        watch: &'a mut dyn FnMut(&Shot<'_>) -> bool,
+    ) -> Self {
+        let tally = Tally::default();
+        Self { settings, tally, clock, watch, rows: Vec::new(), runs: 0 }
+    }
+
+    /// The figures and measures.
+    pub fn finish(self) -> (Vec<Row>, Tally) {
+        (self.rows, self.tally)
+    }
+
+    /// Vertices a side of a square sheet, as asked or `default`.
+    pub fn side(&self, default: u32) -> u32 {
+        let of_count = |v: u32| (f64::from(v).sqrt().round() as u32).clamp(2, 400);
+        self.settings.vertices.map(of_count).or(self.settings.n).unwrap_or(default)
+    }
+
+    /// The bench's material, or the fabric that was asked for, without air.
+    pub fn material(&self, default: Material) -> Material {
+        let Some(fabric) = self.settings.fabric else { return default };
+        let keep = Material { ..default };
+        Material {
+            friction: keep.friction,
+            drag: keep.drag,
+            damping_s: keep.damping_s,
+            offset: keep.offset,
+            ..fabric.material()
+        }
+    }
+
+    /// Puts a model at rest on the stage.
+    pub fn sim(&mut self, model: Model, frame_s: f32) -> Sim {
+        self.runs += 1;
+        let state = model.rest_state();
+        self.tally.vertices = self.tally.vertices.max(state.positions.len());
+        Sim {
+            state,
+            model,
+            frame_s,
+            dt_s: self.settings.dt_s.unwrap_or(SUBSTEP_S_MAX),
+            effort: Effort::default(),
+            time_s: 0.0,
+            hits_every: 0,
+            frames: 0,
+            run: self.runs - 1,
+            workspace: Workspace::default(),
+        }
+    }
+
+    /// A frame, with the body moving from the first pose to the second.
+    ///
+    /// # Errors
+    /// A state that is not finite, or the caller's wish to stop.
+    pub fn step(&mut self, sim: &mut Sim, motion: Option<(&Pose, &Pose)>) -> Result<(), LabError> {
+        let refine = (SUBSTEP_S_MAX / sim.dt_s - 1e-3).ceil().max(1.0) as u32;
+        let span = Span { motion, seconds: sim.frame_s, refine };
+        let start = (self.clock)();
+        sim.effort = step(&sim.model, &span, &mut sim.state, &mut sim.workspace)?;
+        let took = (self.clock)() - start;
+        // The first frame of a run also fills memory.
+        if sim.frames > 0 {
+            self.tally.cpu_s += took;
+            self.tally.timed_s += f64::from(sim.frame_s);
+        }
+        sim.frames += 1;
+        sim.time_s += sim.frame_s;
+        self.measure(sim);
+        let body = sim.model.surface().map(|s| (sim.body(), s.triangles()));
+        let shot = Shot {
+            run: sim.run,
+            time_s: sim.time_s,
+            positions: &sim.state.positions,
+            triangles: sim.model.mesh().triangles(),
+            body,
+        };
+        if (self.watch)(&shot) { Ok(()) } else { Err(LabError::Stopped) }
+    }
+
+    fn measure(&mut self, sim: &Sim) {
+        let (mesh, at) = (sim.model.mesh(), &sim.state.positions);
+        let t = &mut self.tally;
+        t.frames += 1;
+        t.simulated_s += f64::from(sim.frame_s);
+        t.substeps += u64::from(sim.effort.substeps);
+        t.iterations += u64::from(sim.effort.iterations);
+        t.stretch_p99 = t.stretch_p99.max(measure::stretch_quantile(mesh, at, 0.99));
+        t.stretch_max = t.stretch_max.max(measure::stretch_max(mesh, at));
+        t.lowest_m = at.iter().map(|p| p.y).fold(t.lowest_m, f32::min);
+        let fastest = sim.state.velocities.iter().map(|v| v.length_squared()).fold(0.0, f32::max);
+        t.speed_max_m_s = t.speed_max_m_s.max(fastest.sqrt());
+        if sim.hits_every > 0 && sim.frames.is_multiple_of(sim.hits_every) {
+            t.self_hits = t.self_hits.max(hits::count(mesh, at));
+        }
+    }
+
+    /// Lets the cloth come to rest: whenever its motion slows down, it is stopped (kinetic
+    /// damping), until the fastest vertex stays below `speed` (m/s) or `frames` are over.
+    ///
+    /// # Errors
+    /// As [`Stage::step`].
+    pub fn settle(
+        &mut self,
+        sim: &mut Sim,
+        motion: Option<(&Pose, &Pose)>,
+        speed: f32,
+        frames: u32,
+    ) -> Result<(), LabError> {
+        let (mut before, mut calm) = (0.0, 0);
+        for _ in 0..frames {
+            self.step(sim, motion)?;
+            let v = &sim.state.velocities;
+            let fastest = v.iter().map(|v| v.length_squared()).fold(0.0, f32::max).sqrt();
+            let energy: f64 = v.iter().map(|v| f64::from(v.length_squared())).sum();
+            if energy < before {
+                sim.state.velocities.fill(Vec3::ZERO);
+                before = 0.0;
+                calm = if fastest < speed { calm + 1 } else { 0 };
+                if calm >= 3 {
+                    break;
+                }
+            } else {
+                before = energy;
+            }
+        }
+        Ok(())
+    }
+
+    /// Puts a figure on record.
+    pub fn row(
+        &mut self,
+        what: impl Into<String>,
+        figure: f64,
+        unit: &'static str,
+        reference: impl Into<String>,
+        limit: Limit,
+    ) {
+        let (what, reference) = (what.into(), reference.into());
+        self.rows.push(Row { what, figure, unit, reference, limit });
+    }
+}
