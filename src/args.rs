@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
+use explorer::grow::policy::Policy;
 
 /// Near-exhaustive precomputed cloth: explore, publish, stream, play.
 #[derive(Debug, Parser)]
@@ -60,6 +61,9 @@ pub struct Up {
     /// Simulation threads [default: all cores].
     #[arg(long)]
     pub workers: Option<usize>,
+    /// Which merges are undone first: greedy, visited or predictive (see `toile explore`).
+    #[arg(long, default_value = "greedy", value_parser = policy)]
+    pub policy: Policy,
     /// QUIC address.
     #[arg(long, default_value = "127.0.0.1:0")]
     pub listen: SocketAddr,
@@ -98,6 +102,16 @@ pub struct Explore {
     /// Vertices of the garment, exactly [default: as the scene says].
     #[arg(long, value_name = "N")]
     pub vertices: Option<usize>,
+    /// Which merges are undone first: greedy (the largest error), visited (error times the
+    /// probability that a player passes), predictive (the error expected to be seen).
+    #[arg(long, default_value = "greedy", value_parser = policy)]
+    pub policy: Policy,
+    /// Undo merges in these clips only, e.g. walk,run [default: all].
+    #[arg(long, value_name = "CLIP,CLIP", value_delimiter = ',')]
+    pub clips: Vec<String>,
+    /// Stop before less than this is left on the disk (MB).
+    #[arg(long, value_name = "MB", default_value_t = 256)]
+    pub keep_free: u64,
     /// The paper's plain algorithm: no early stop, no re-merging.
     #[arg(long)]
     pub paper: bool,
@@ -305,6 +319,10 @@ pub struct LabRun {
     /// Write the first run as an animated glTF file.
     #[arg(long, value_name = "FILE.glb")]
     pub export: Option<PathBuf>,
+}
+
+fn policy(text: &str) -> Result<Policy, String> {
+    text.parse()
 }
 
 fn duration(text: &str) -> Result<Duration, String> {

@@ -28,15 +28,23 @@ pub fn run(a: args::Explore) -> Result<()> {
         workers: place::workers(a.workers)?,
         frames: a.frames,
         error_m: a.error.map(|mm| mm / 1000.0),
+        policy: a.policy,
+        clips: a.clips,
+        keep_free_bytes: a.keep_free.saturating_mul(1_000_000),
         paper: a.paper,
         best_prefix_at_end: true,
         should_stop: stop.asked(),
     };
     let mut live = Live::new(a.frames);
+    let mut told = false;
     let mut version = None;
     let summary = explore_blocking(&scene, &opened, work, &options, &mut |progress| {
         if let Some(failure) = &progress.failure {
             live.note(&format!("a job was given up: {failure}"));
+        }
+        if !told && progress.phase != Phase::Drape {
+            told = true;
+            live.note(&forecast(progress, a.frames));
         }
         if progress.version != version {
             version = progress.version;
@@ -82,6 +90,24 @@ pub fn explore_blocking(
     Ok(runtime.block_on(explore(scene, &simulators, &place, options, progress))?)
 }
 
+/// What the run will cost, by what a frame cost so far.
+fn forecast(p: &Progress, frames: Option<u64>) -> String {
+    let left = frames.unwrap_or(p.initial_frames.max(1000)).saturating_sub(p.simulated_frames);
+    let what = match frames {
+        Some(frames) => format!("up to {frames} frames, {left} are left: "),
+        None => format!("no end was given; {left} more frames: "),
+    };
+    let free = p
+        .cost
+        .free_bytes
+        .map_or(String::new(), |free| format!(" ({} are free)", format::bytes(free)));
+    format!(
+        "{what}about {:.2} CPU h and {} in the work folder{free}",
+        left as f64 * p.cost.cpu_s / 3600.0,
+        format::bytes(left * p.cost.work_bytes)
+    )
+}
+
 /// One line about an exploration.
 pub fn line(p: &Progress) -> String {
     let version = p.version.map_or("no version yet".into(), |v| format!("version {v}"));
@@ -114,6 +140,19 @@ fn print(s: &Summary) {
         s.simulate_cpu_s,
         s.simulate_cpu_s / (s.simulated_frames.max(1)) as f64
     );
+    println!(
+        "policy {}; merges as players pass them: mean {:.1} mm, 95 % below {:.1} mm",
+        s.policy, s.visited_mean_mm, s.visited_p95_mm
+    );
+    for class in s.classes.iter().filter(|class| !class.class.is_empty()) {
+        println!("class {}: {} states", class.class, class.states);
+    }
+    if s.classes.len() > 1 {
+        println!(
+            "{} merges across classes, {} of them implausible",
+            s.merges_across_classes, s.implausible_merges
+        );
+    }
     let q = &s.quality;
     println!(
         "simulated cloth: largest strain {:.1} %; {} of {} vertex-frames deeper than 5 mm \
@@ -131,6 +170,9 @@ fn print(s: &Summary) {
     match s.end {
         End::Stopped => println!("stopped; the same command goes on from here"),
         End::Frames | End::Error => {}
+        End::Disk => println!(
+            "stopped short of a full disk (--keep-free); make room, and the same command goes on"
+        ),
         End::Exhausted => println!("no dead end is left to expand"),
     }
 }

@@ -65,6 +65,7 @@ pub fn run(a: &args::Up) -> Result<()> {
     }
     let options = ExploreOptions {
         workers: place::workers(a.workers)?,
+        policy: a.policy,
         best_prefix_at_end: false,
         should_stop: stop.asked(),
         ..ExploreOptions::default()

@@ -3,21 +3,31 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Instant;
 
 use object_store::ObjectStore;
 use protocol::{SigningKey, VersionNumber};
-use serde::Serialize;
 
+use crate::cpu::CpuClock;
+use crate::disk::free_bytes;
 use crate::grow::graph::Graph;
-use crate::grow::job::JobError;
+use crate::grow::job::{JOB_STATES_MAX, JobError};
 use crate::grow::ledger::Phase;
-use crate::grow::record::PublishRecord;
+use crate::grow::policy::Policy;
+use crate::grow::record::{PublishRecord, SteerRecord};
 use crate::grow::round::{self, Ended, RoundError};
 use crate::grow::work::{Work, WorkError};
 use crate::pack::{EncodeSettings, PublishError, Publisher, collect_leftovers};
 use crate::scene::Scene;
-use crate::simulator::{FrameQuality, SimulateError, Simulator, SimulatorFactory};
+use crate::simulator::{SimulateError, Simulator, SimulatorFactory};
+use crate::telemetry::{Walked, walked_since};
 use crate::view::GraphView;
+
+#[path = "explore_report.rs"]
+mod report;
+
+use report::Run;
+pub use report::{ClassCount, End, FrameCost, Progress, Summary};
 
 /// Most workers of one process.
 pub const WORKERS_MAX: usize = 1024;
@@ -32,6 +42,13 @@ pub struct ExploreOptions {
     pub frames: Option<u64>,
     /// Ends once the best prefix's worst merge error is at most this (m).
     pub error_m: Option<f32>,
+    /// Which dead ends are simulated first. Taken up at the next round, whatever it was before.
+    pub policy: Policy,
+    /// Names of clips: only dead ends in these are simulated; none: in all.
+    pub clips: Vec<String>,
+    /// Ends before less than this much is left on the disk of the work folder or of a local store,
+    /// beside what a round may need (bytes).
+    pub keep_free_bytes: u64,
     /// As in the paper: neither early stop nor re-merging.
     pub paper: bool,
     /// Whether an exploration that ends by `frames` or `error_m` leaves the best prefix as head
@@ -48,94 +65,14 @@ impl Default for ExploreOptions {
             workers: 1,
             frames: None,
             error_m: None,
+            policy: Policy::Greedy,
+            clips: Vec::new(),
+            keep_free_bytes: 256 << 20,
             paper: false,
             best_prefix_at_end: true,
             should_stop: Arc::new(|| false),
         }
     }
-}
-
-/// Where an exploration stands; given after every job.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Progress {
-    /// What is being done.
-    pub phase: Phase,
-    /// Frames simulated, drape apart.
-    pub simulated_frames: u64,
-    /// Frames of the initial pass.
-    pub initial_frames: u64,
-    /// States, dead ends included.
-    pub states: u64,
-    /// Dead ends in the queue.
-    pub queued: u64,
-    /// Largest merge error (m).
-    pub worst_error_m: f32,
-    /// Lowest worst merge error so far (m), once there is a whole graph.
-    pub best_worst_error_m: Option<f32>,
-    /// Mean merge error (m).
-    pub mean_error_m: f32,
-    /// The newest version published from this work folder.
-    pub version: Option<VersionNumber>,
-    /// Jobs given up; their dead ends are set aside.
-    pub failed_jobs: u64,
-    /// Measures of all frames, the drape's included.
-    pub quality: FrameQuality,
-    /// CPU seconds of jobs (wall seconds where the system does not tell), over all runs.
-    pub simulate_cpu_s: f64,
-    /// Why the job that ended just now was given up.
-    pub failure: Option<String>,
-}
-
-/// Why an exploration ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum End {
-    /// `should_stop` said so.
-    Stopped,
-    /// The number of frames was reached.
-    Frames,
-    /// The error was reached.
-    Error,
-    /// No dead end is left that could be expanded.
-    Exhausted,
-}
-
-/// What is known at the end. The keys are those of `toile explore --json`; the graph is the
-/// newest, of which the head may show a prefix.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Summary {
-    /// Poses of the primary graph.
-    pub poses: u64,
-    /// Edges of the primary graph.
-    pub edges: u64,
-    /// States, dead ends included.
-    pub states: u64,
-    /// Trajectories.
-    pub trajectories: u64,
-    /// Dead ends, each merged.
-    pub merges: u64,
-    /// Largest merge error (mm).
-    pub worst_error_mm: f64,
-    /// Lowest worst merge error since the initial pass (mm).
-    pub best_worst_error_mm: f64,
-    /// Mean merge error (mm).
-    pub mean_error_mm: f64,
-    /// Frames simulated, drape apart.
-    pub simulated_frames: u64,
-    /// CPU seconds of jobs (wall seconds where the system does not tell), over all runs.
-    pub simulate_cpu_s: f64,
-    /// The newest version published; 0 for none.
-    pub version: u64,
-    /// Jobs given up.
-    pub failed_jobs: u64,
-    /// Frames that were simulated again at a finer step.
-    pub frames_retried: u64,
-    /// Frames that came out of bounds all the same.
-    pub frames_flagged: u64,
-    /// Measures of all frames, the drape's included.
-    pub quality: FrameQuality,
-    /// Why it ended.
-    pub end: End,
 }
 
 /// Why an exploration could not go on. What was reported as done is safe.
@@ -148,6 +85,12 @@ pub enum ExploreError {
     /// A round of jobs.
     #[error("exploring: {0}")]
     Round(#[from] RoundError),
+    /// A clip that is not there.
+    #[error("there is no clip {0:?} to explore in; the scene has {1}")]
+    NoClip(String, String),
+    /// What players walked could not be read.
+    #[error("reading what players walked: {0}")]
+    Telemetry(#[from] object_store::Error),
     /// The garment could not be draped on the start pose.
     #[error("draping the garment: {0}")]
     Drape(SimulateError),
@@ -220,8 +163,9 @@ pub async fn explore(
         collect_leftovers(folder)
             .map_err(|source| ExploreError::Leftovers { folder: folder.clone(), source })?;
     }
-    let mut publisher = Garment(publisher, &scene.garment.name);
-    let setup = Setup { scene, simulators, work: &place.work, options };
+    let mut publisher = Garment(publisher, &scene.garment.name, &*place.store);
+    let folder = place.folder.as_deref();
+    let setup = Setup { scene, simulators, work: &place.work, folder, options };
     run(setup, work, &mut publisher, progress).await
 }
 
@@ -232,10 +176,13 @@ trait Publish {
 
     /// Makes the graph the head; says its number.
     async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError>;
+
+    /// What players walked since this batch of telemetry.
+    async fn walked(&self, after: u64) -> Result<Walked, object_store::Error>;
 }
 
 /// The store's publisher, for the garment of this name.
-struct Garment<'a>(Publisher, &'a str);
+struct Garment<'a>(Publisher, &'a str, &'a dyn ObjectStore);
 
 impl Publish for Garment<'_> {
     fn head(&self) -> (Option<VersionNumber>, u64) {
@@ -248,6 +195,13 @@ impl Publish for Garment<'_> {
     async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError> {
         Ok(self.0.publish(view).await?.number)
     }
+
+    async fn walked(&self, after: u64) -> Result<Walked, object_store::Error> {
+        match self.0.head().and_then(|head| head.garment(self.1)) {
+            Some(garment) => walked_since(self.2, garment.id, after).await,
+            None => Ok(Walked { newest: after, ..Walked::default() }),
+        }
+    }
 }
 
 /// What is explored, and from what.
@@ -255,6 +209,8 @@ struct Setup<'a> {
     scene: &'a Scene,
     simulators: &'a dyn SimulatorFactory,
     work: &'a Path,
+    /// The store's folder, where it is one.
+    folder: Option<&'a Path>,
     options: &'a ExploreOptions,
 }
 
@@ -272,48 +228,118 @@ async fn run(
         let folder = setup.work.to_owned();
         return Err(ExploreError::StoreAhead { stored, folder, known });
     }
+    let clips = clips(scene, &options.clips)?;
+    let mut run = Run { start: Instant::now(), first: work.graph().next_id().0, drape_cpu_s: 0.0 };
     let workers = options.workers.clamp(1, WORKERS_MAX);
     let mut simulators: Vec<Box<dyn Simulator>> =
         (0..workers).map(|_| setup.simulators.simulator()).collect();
-    let every = scene.exploration.publish_every_frames.max(1);
     // A store that lost versions, or a new one for an old folder, is brought up to date at once.
     let mut behind = work.ledger().published().is_some_and(|p| head < Some(p.number));
     let stop = || (options.should_stop)();
-    progress(&progress_of(&work, None));
+    progress(&run.progress(&setup, &work, None));
     loop {
         if work.ledger().round().is_done() {
-            if work.ledger().phase() == Phase::Drape {
-                let frame = simulators[0].drape().map_err(ExploreError::Drape)?;
-                work.drape(&frame)?;
-            }
-            if work.ledger().phase() == Phase::Merge {
-                work.merge_initial()?;
-            }
-            if work.ledger().phase() == Phase::Expansion {
-                if behind || due(&work, every) {
-                    let newest = work.graph().commit();
-                    publish(&mut work, publisher, newest).await?;
-                    behind = false;
-                    progress(&progress_of(&work, None));
-                }
-                if let Some(end) = reached(work.graph(), options) {
-                    return finish(work, publisher, options, end).await;
-                }
+            let ended = between_rounds(
+                &setup,
+                (&mut work, &mut run),
+                (publisher, &mut behind),
+                simulators[0].as_mut(),
+                progress,
+            );
+            if let Some(end) = ended.await? {
+                return finish(&setup, work, &run, publisher, end).await;
             }
             if stop() {
-                return Ok(summary(&work, End::Stopped));
+                return Ok(run.summary(&setup, &work, End::Stopped));
             }
+            if disk_is_nearly_full(&setup, &work) {
+                return Ok(run.summary(&setup, &work, End::Disk));
+            }
+            steer(&mut work, publisher, options.policy, &clips).await?;
             if !work.open_round() {
-                return finish(work, publisher, options, End::Exhausted).await;
+                return finish(&setup, work, &run, publisher, End::Exhausted).await;
             }
         }
         let mut each = |work: &Work, failure: Option<&JobError>| {
-            progress(&progress_of(work, failure));
+            progress(&run.progress(&setup, work, failure));
         };
         if round::run(&mut work, &mut simulators, &stop, &mut each)? == Ended::Stopped {
-            return Ok(summary(&work, End::Stopped));
+            return Ok(run.summary(&setup, &work, End::Stopped));
         }
     }
+}
+
+/// Drapes, ends the initial pass, publishes what is due, and says whether an end was reached.
+async fn between_rounds(
+    setup: &Setup<'_>,
+    (work, run): (&mut Work, &mut Run),
+    (publisher, behind): (&mut impl Publish, &mut bool),
+    simulator: &mut dyn Simulator,
+    progress: &mut dyn FnMut(&Progress),
+) -> Result<Option<End>, ExploreError> {
+    if work.ledger().phase() == Phase::Drape {
+        let clock = CpuClock::start();
+        let frame = simulator.drape().map_err(ExploreError::Drape)?;
+        run.drape_cpu_s = clock.elapsed_s();
+        work.drape(&frame)?;
+        progress(&run.progress(setup, work, None));
+    }
+    if work.ledger().phase() == Phase::Merge {
+        work.merge_initial()?;
+    }
+    if work.ledger().phase() != Phase::Expansion {
+        return Ok(None);
+    }
+    let every = setup.scene.exploration.publish_every_frames.max(1);
+    if *behind || due(work, every) {
+        let newest = work.graph().commit();
+        publish(work, publisher, newest).await?;
+        *behind = false;
+        progress(&run.progress(setup, work, None));
+    }
+    Ok(reached(work.graph(), setup.options))
+}
+
+/// Places of clips by name.
+fn clips(scene: &Scene, names: &[String]) -> Result<Vec<u16>, ExploreError> {
+    let all = scene.primary.clips();
+    let place = |name: &String| {
+        let found = all.iter().position(|clip| clip == name).map(|clip| clip as u16);
+        found.ok_or_else(|| ExploreError::NoClip(name.clone(), all.join(", ")))
+    };
+    names.iter().map(place).collect()
+}
+
+/// Records what jobs are chosen by from here on, where that has changed.
+async fn steer(
+    work: &mut Work,
+    publisher: &impl Publish,
+    policy: Policy,
+    clips: &[u16],
+) -> Result<(), ExploreError> {
+    if work.ledger().phase() != Phase::Expansion {
+        return Ok(());
+    }
+    let steering = work.ledger().steering();
+    let after = steering.telemetry();
+    let walked = match policy {
+        Policy::Visited => publisher.walked(after).await?,
+        Policy::Greedy | Policy::Predictive => Walked { newest: after, ..Walked::default() },
+    };
+    if steering.policy() != policy || steering.clips() != clips || walked.newest != after {
+        let (clips, telemetry) = (clips.to_vec(), walked.newest);
+        let counts = walked.counts.into_iter().collect();
+        work.steer(SteerRecord { policy, clips, telemetry, counts })?;
+    }
+    Ok(())
+}
+
+fn disk_is_nearly_full(setup: &Setup<'_>, work: &Work) -> bool {
+    let states = u64::from(setup.scene.exploration.round_jobs.max(1)) * JOB_STATES_MAX as u64;
+    // A store's chunks of them, with a basis, are smaller than the exact states.
+    let needed = states.min(100_000) * work.state_bytes() + setup.options.keep_free_bytes;
+    let short = |folder: &Path| free_bytes(folder).is_some_and(|free| free < needed);
+    short(setup.work) || setup.folder.is_some_and(short)
 }
 
 /// Whether a multiple of `every` frames was passed since the last version.
@@ -329,7 +355,7 @@ fn reached(graph: &Graph, options: &ExploreOptions) -> Option<End> {
     if options.frames.is_some_and(|frames| graph.simulated_frames() >= frames) {
         return Some(End::Frames);
     }
-    let best_m = graph.best_worst_error_m()?;
+    let best_m = graph.best_worst_cost_m()?;
     options.error_m.is_some_and(|error_m| best_m <= error_m).then_some(End::Error)
 }
 
@@ -345,60 +371,19 @@ async fn publish(
 
 /// Leaves the best prefix, or else the newest graph, as the head.
 async fn finish(
+    setup: &Setup<'_>,
     mut work: Work,
+    run: &Run,
     publisher: &mut impl Publish,
-    options: &ExploreOptions,
     end: End,
 ) -> Result<Summary, ExploreError> {
     let newest = work.graph().commit();
-    let best = work.graph().best_commit().filter(|_| options.best_prefix_at_end);
+    let best = work.graph().best_commit().filter(|_| setup.options.best_prefix_at_end);
     let shown = best.unwrap_or(newest);
     if work.ledger().published().map(|last| last.shown) != Some(shown) {
         publish(&mut work, publisher, shown).await?;
     }
-    Ok(summary(&work, end))
-}
-
-fn progress_of(work: &Work, failure: Option<&JobError>) -> Progress {
-    let (ledger, graph) = (work.ledger(), work.graph());
-    Progress {
-        phase: ledger.phase(),
-        simulated_frames: graph.simulated_frames(),
-        initial_frames: ledger.plan().frames(),
-        states: graph.next_id().0,
-        queued: graph.queue().len() as u64,
-        worst_error_m: graph.worst_error_m(),
-        best_worst_error_m: graph.best_worst_error_m(),
-        mean_error_m: graph.mean_error_m(),
-        version: ledger.published().map(|last| last.number),
-        failed_jobs: ledger.set_aside().len() as u64,
-        quality: *ledger.quality(),
-        simulate_cpu_s: work.simulate_cpu_s(),
-        failure: failure.map(ToString::to_string),
-    }
-}
-
-fn summary(work: &Work, end: End) -> Summary {
-    let (ledger, graph) = (work.ledger(), work.graph());
-    let millimetres = |m: f32| f64::from(m) * 1000.0;
-    Summary {
-        poses: graph.primary().poses().len() as u64,
-        edges: graph.primary().edges().len() as u64,
-        states: graph.next_id().0,
-        trajectories: graph.runs().len() as u64,
-        merges: graph.queue().len() as u64,
-        worst_error_mm: millimetres(graph.worst_error_m()),
-        best_worst_error_mm: millimetres(graph.best_worst_error_m().unwrap_or(0.0)),
-        mean_error_mm: millimetres(graph.mean_error_m()),
-        simulated_frames: graph.simulated_frames(),
-        simulate_cpu_s: work.simulate_cpu_s(),
-        version: ledger.published().map_or(0, |last| last.number.0),
-        failed_jobs: ledger.set_aside().len() as u64,
-        frames_retried: ledger.quality().frames_retried,
-        frames_flagged: ledger.quality().frames_flagged,
-        quality: *ledger.quality(),
-        end,
-    }
+    Ok(run.summary(setup, &work, end))
 }
 
 #[cfg(test)]

@@ -49,6 +49,10 @@ impl Publish for Memory {
         }
         Ok(VersionNumber(self.versions.len() as u64))
     }
+
+    async fn walked(&self, after: u64) -> Result<Walked, object_store::Error> {
+        Ok(Walked { newest: after, ..Walked::default() })
+    }
 }
 
 /// Every link of a version leads to a playable state of the right pose; retired ones go on.
@@ -91,7 +95,7 @@ fn explore(
     (folder, store): (&Path, &mut Memory),
     options: &ExploreOptions,
 ) -> Result<Summary, ExploreError> {
-    let setup = Setup { scene, simulators: toy, work: folder, options };
+    let setup = Setup { scene, simulators: toy, work: folder, folder: None, options };
     let work = Work::open(folder, scene, options.paper)?;
     block_on(run(setup, work, store, &mut |_| {}))
 }
@@ -282,7 +286,7 @@ fn without_paper_dead_ends_move_to_nearer_states() {
     let work = Work::open(folder.path(), &scene, false).unwrap();
     assert!(work.graph().states().iter().any(|state| state.merges.len() > 1));
     // Each dead end is merged into the nearest interior state of its pose, whatever its age.
-    let metric = &work.rules().metric;
+    let metric = work.similar().metric();
     for (id, state) in (0..).zip(work.graph().states()) {
         if let Kind::DeadEnd { error_m, .. } = state.kind {
             let frame = work.states().read(StateId(id)).unwrap();
@@ -318,8 +322,13 @@ fn an_edge_that_fails_costs_its_jobs_only() {
     let broken = Toy { broken: Some(EdgeId(3)), ..sound };
     let mut failures = 0;
     let options = ExploreOptions { workers: 2, ..options(150) };
-    let setup =
-        Setup { scene: &scene, simulators: &broken, work: folder.path(), options: &options };
+    let setup = Setup {
+        scene: &scene,
+        simulators: &broken,
+        work: folder.path(),
+        folder: None,
+        options: &options,
+    };
     let work = Work::open(folder.path(), &scene, false).unwrap();
     let mut count = |progress: &Progress| failures += u64::from(progress.failure.is_some());
     let summary = block_on(run(setup, work, &mut store, &mut count)).unwrap();

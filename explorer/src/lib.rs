@@ -7,8 +7,10 @@
 //! Non-goals: who is connected (they meet in the store), what a region's bytes mean (`codec`).
 
 pub mod builtin;
+pub mod certificate;
 pub mod cloth_simulator;
 pub mod cpu;
+pub mod disk;
 pub mod explore;
 pub mod grid;
 pub mod grow;
@@ -18,6 +20,7 @@ pub mod primary;
 pub mod scene;
 pub mod simulate;
 pub mod simulator;
+pub mod telemetry;
 pub mod view;
 pub mod watchdog;
 

@@ -20,8 +20,55 @@ pub struct Scene {
     pub start: PoseId,
     /// The garment.
     pub garment: Garment,
-    /// How states are compared and how far exploration goes.
+    /// How far exploration goes.
     pub exploration: ExplorationSettings,
+    /// How states are compared, beyond [`ExplorationSettings::velocity_time_s`].
+    pub metric: MetricSettings,
+}
+
+/// How vertices' distances become one distance.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Norm {
+    /// The largest, as in the paper (Kim et al. 2013, section 5.1).
+    #[default]
+    Largest,
+    /// The root mean square.
+    Rms,
+}
+
+/// What a garment adds to the metric (Kim et al. 2013, section 3.3).
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct MetricSettings {
+    /// How vertices' distances become one.
+    pub norm: Norm,
+    /// Weight of each vertex, at least 0; empty where all are 1.
+    pub weights: Vec<f32>,
+    /// Classes of states; at most [`CLASS_RULES_MAX`].
+    pub classes: Vec<ClassRule>,
+}
+
+/// Most rules of a scene: a state's class has one bit of each.
+pub const CLASS_RULES_MAX: usize = 8;
+
+/// Divides states into two values by where a region of the garment lies relative to a joint.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ClassRule {
+    /// What is classified, e.g. `hood`.
+    pub name: String,
+    /// The value below the threshold and the value above it, e.g. `down`, `up`.
+    pub values: [String; 2],
+    /// The joint.
+    pub joint: u16,
+    /// Vertices whose mean place counts; not empty.
+    pub vertices: Vec<u32>,
+    /// Unit vector in the axes of the rest pose, carried along by the joint.
+    pub axis: Vec3,
+    /// How far the mean place lies from the joint along the axis where the value changes (m).
+    pub threshold_m: f32,
+    /// A merge from the first value into the second is implausible (places in `values`).
+    pub implausible: [u8; 2],
+    /// What such a merge costs in the queue on top of its error (m).
+    pub penalty_m: f32,
 }
 
 /// A garment in the rest pose of the character it was made for.

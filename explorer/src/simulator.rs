@@ -14,6 +14,12 @@ pub trait Simulator: Send {
     /// Whatever went wrong, in words; the job is given up, the run goes on.
     fn step(&mut self, state: &GridState, edge: EdgeId) -> Result<Frame, SimulateError>;
 
+    /// Whether a step that failed may succeed when it is asked for again, as with a program that
+    /// died and is started anew.
+    fn may_recover(&self) -> bool {
+        false
+    }
+
     /// The garment draped on the start pose: checked against the body in the rest pose, brought
     /// to the start pose over some frames, settled.
     ///

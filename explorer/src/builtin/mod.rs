@@ -27,7 +27,7 @@ use std::sync::Arc;
 use protocol::PoseId;
 
 use crate::primary::PrimaryError;
-use crate::scene::{ExplorationSettings, Scene};
+use crate::scene::{ExplorationSettings, MetricSettings, Scene};
 
 /// Why the built-in scene could not be made: our own mistake, never the caller's.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -96,6 +96,7 @@ pub fn robe(vertices: Option<usize>) -> Result<Scene, BuiltinError> {
             drape_frames: 20,
             ..ExplorationSettings::default()
         },
+        metric: MetricSettings::default(),
     })
 }
 

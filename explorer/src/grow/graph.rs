@@ -14,6 +14,7 @@ use std::sync::Arc;
 
 use protocol::{EdgeId, PoseId, StateId};
 
+use super::class::{Class, Penalties};
 use super::queue::Queue;
 use crate::primary::PrimaryGraph;
 use crate::view::Run;
@@ -56,6 +57,8 @@ pub struct Merge {
 pub struct State {
     /// Its pose.
     pub pose: PoseId,
+    /// Its class; 0 where the scene has no rules.
+    pub class: Class,
     /// The state it was simulated from, and along which edge; `None` for the drape.
     pub parent: Option<(StateId, EdgeId)>,
     /// What it is now.
@@ -75,6 +78,8 @@ pub struct Moment {
     pub runs: usize,
     /// Largest merge error (m).
     pub worst_error_m: f32,
+    /// Largest merge error with the penalty for crossing classes (m).
+    pub worst_cost_m: f32,
 }
 
 /// An operation that does not fit the graph.
@@ -113,6 +118,9 @@ pub struct Graph {
     interior: Vec<Vec<StateId>>,
     dead_ends: Vec<BTreeSet<StateId>>,
     queue: Queue,
+    /// Merges that carry a penalty, by cost.
+    crossing: Queue,
+    penalties: Penalties,
     open: BTreeSet<StateId>,
     moments: Vec<Moment>,
     initialised: Option<u64>,
@@ -121,6 +129,11 @@ pub struct Graph {
 impl Graph {
     /// The graph of the drape alone, which is state 0 and commit 0.
     pub fn new(primary: Arc<PrimaryGraph>, start: PoseId) -> Self {
+        Self::with_penalties(primary, start, Penalties::default())
+    }
+
+    /// As [`Graph::new`], where merges between classes cost something.
+    pub fn with_penalties(primary: Arc<PrimaryGraph>, start: PoseId, penalties: Penalties) -> Self {
         let poses = primary.poses().len();
         let mut graph = Self {
             primary,
@@ -129,11 +142,13 @@ impl Graph {
             interior: vec![Vec::new(); poses],
             dead_ends: vec![BTreeSet::new(); poses],
             queue: Queue::default(),
+            crossing: Queue::default(),
+            penalties,
             open: BTreeSet::new(),
             moments: Vec::new(),
             initialised: None,
         };
-        graph.push(start, None);
+        graph.push(start, None, 0);
         graph.end_commit();
         graph
     }
@@ -215,14 +230,33 @@ impl Graph {
         ((sum + 0.0) / self.queue.len().max(1) as f64) as f32
     }
 
-    /// The commit with the lowest worst error since the initial pass, of equals the last (the
-    /// paper's Figure 7); `None` before the end of that pass.
+    /// What a dead end's merge costs (m): its error, and the penalty for crossing classes. 0 for
+    /// any other state.
+    pub fn cost_m(&self, state: StateId) -> f32 {
+        match self.state(state).kind {
+            Kind::DeadEnd { target, error_m } => error_m + self.penalty_m(state, target),
+            _ => 0.0,
+        }
+    }
+
+    /// The penalty for merging `state` into `target` (m).
+    pub fn penalty_m(&self, state: StateId, target: StateId) -> f32 {
+        self.penalties.of(self.state(state).class, self.state(target).class)
+    }
+
+    /// Merges that carry a penalty.
+    pub fn crossings(&self) -> usize {
+        self.crossing.len()
+    }
+
+    /// The commit with the lowest worst error, penalties included, since the initial pass, of
+    /// equals the last (the paper's Figure 7); `None` before the end of that pass.
     pub fn best_commit(&self) -> Option<u64> {
         let first = self.initialised?;
         let since = &self.moments[first as usize..];
-        let key = |m: &Moment| m.worst_error_m;
+        let key = |m: &Moment| m.worst_cost_m;
         let least = since.iter().map(key).fold(f32::INFINITY, f32::min);
-        let last = since.iter().rposition(|m| m.worst_error_m <= least)?;
+        let last = since.iter().rposition(|m| m.worst_cost_m <= least)?;
         Some(first + last as u64)
     }
 
@@ -237,9 +271,14 @@ impl Graph {
         }
     }
 
-    /// Lowest worst merge error since the initial pass (m); `None` before its end.
+    /// Worst merge error of the best prefix (m); `None` before the end of the initial pass.
     pub fn best_worst_error_m(&self) -> Option<f32> {
         Some(self.moments[self.best_commit()? as usize].worst_error_m)
+    }
+
+    /// The same with the penalty for crossing classes (m): what the stop rule goes by.
+    pub fn best_worst_cost_m(&self) -> Option<f32> {
+        Some(self.moments[self.best_commit()? as usize].worst_cost_m)
     }
 
     /// Adds the state simulated from `parent` along `edge`; it is open.
@@ -247,16 +286,34 @@ impl Graph {
     /// # Errors
     /// `parent` is not open, or the edge is not one of its pose or was simulated before.
     pub fn attach(&mut self, parent: StateId, edge: EdgeId) -> Result<StateId, GraphError> {
+        self.attach_class(parent, edge, 0)
+    }
+
+    /// As [`Graph::attach`], of a state of this class.
+    ///
+    /// # Errors
+    /// As for [`Graph::attach`].
+    pub fn attach_class(
+        &mut self,
+        parent: StateId,
+        edge: EdgeId,
+        class: Class,
+    ) -> Result<StateId, GraphError> {
         let slot = match &self.known(parent)?.kind {
             Kind::Open { next } => self.slot(parent, edge).filter(|slot| next[*slot].is_none()),
             other => return Err(GraphError::WrongKind(parent, other.name(), "an open state")),
         };
         let slot = slot.ok_or(GraphError::WrongEdge(parent, edge))?;
-        let child = self.push(self.primary.edge(edge).to, Some((parent, edge)));
+        let child = self.push(self.primary.edge(edge).to, Some((parent, edge)), class);
         if let Kind::Open { next } = &mut self.states[parent.index()].kind {
             next[slot] = Some(child);
         }
         Ok(child)
+    }
+
+    /// Says the class of the drape, which is known once it was simulated.
+    pub fn classify_drape(&mut self, class: Class) {
+        self.states[0].class = class;
     }
 
     /// Makes an open state interior: all its edges were simulated.
@@ -315,7 +372,7 @@ impl Graph {
             return Err(GraphError::WrongKind(state, is, "a dead end"));
         };
         let pose = self.state(state).pose;
-        self.queue.remove(state, error_m);
+        self.forget(state, error_m);
         self.dead_ends[pose.index()].remove(&state);
         self.open.insert(state);
         let next = vec![None; self.primary.out_degree(pose)];
@@ -324,7 +381,7 @@ impl Graph {
         Ok(*entry.merges.last().expect("a dead end was merged"))
     }
 
-    /// Moves a dead end to a nearer interior state.
+    /// Moves a dead end to a nearer interior state, penalties included.
     ///
     /// # Errors
     /// `state` is not a dead end, `target` is not an interior state of its pose, or is not nearer.
@@ -339,10 +396,10 @@ impl Graph {
             return Err(GraphError::WrongKind(state, is, "a dead end"));
         };
         self.check_target(state, target, error_m)?;
-        if error_m >= before_m {
+        if error_m + self.penalty_m(state, target) >= self.cost_m(state) {
             return Err(GraphError::WrongError(state, error_m));
         }
-        self.queue.remove(state, before_m);
+        self.forget(state, before_m);
         self.set_merge(state, target, error_m);
         Ok(())
     }
@@ -353,6 +410,7 @@ impl Graph {
             states: self.states.len() as u64,
             runs: self.runs.len(),
             worst_error_m: self.queue.worst_m(),
+            worst_cost_m: self.queue.worst_m().max(self.crossing.worst_m()),
         });
     }
 
@@ -375,11 +433,12 @@ impl Graph {
         self.open.first().map_or(Ok(()), |state| Err(GraphError::NotTotal(*state)))
     }
 
-    fn push(&mut self, pose: PoseId, parent: Option<(StateId, EdgeId)>) -> StateId {
+    fn push(&mut self, pose: PoseId, parent: Option<(StateId, EdgeId)>, class: Class) -> StateId {
         let id = self.next_id();
         let next = vec![None; self.primary.out_degree(pose)];
         self.states.push(State {
             pose,
+            class,
             parent,
             kind: Kind::Open { next },
             interior_since: None,
@@ -402,9 +461,22 @@ impl Graph {
     fn set_merge(&mut self, state: StateId, target: StateId, error_m: f32) {
         let commit = self.moments.len() as u64;
         self.queue.insert(state, error_m);
+        let penalty_m = self.penalty_m(state, target);
+        if penalty_m > 0.0 {
+            self.crossing.insert(state, error_m + penalty_m);
+        }
         let entry = &mut self.states[state.index()];
         entry.kind = Kind::DeadEnd { target, error_m };
         entry.merges.push(Merge { commit, target, error_m });
+    }
+
+    /// Takes a dead end, which must still be one, off both queues.
+    fn forget(&mut self, state: StateId, error_m: f32) {
+        self.queue.remove(state, error_m);
+        let cost_m = self.cost_m(state);
+        if cost_m > error_m {
+            self.crossing.remove(state, cost_m);
+        }
     }
 
     fn known(&self, state: StateId) -> Result<&State, GraphError> {

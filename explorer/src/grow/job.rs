@@ -9,8 +9,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use protocol::{EdgeId, PoseId, StateId};
 
-use super::metric::Metric;
+use super::class::{Class, Classifier};
 use super::plan::{InitialJob, Plan};
+use super::similar::{Found, Similar};
 use super::states::StateFile;
 use crate::grid::GridState;
 use crate::primary::PrimaryGraph;
@@ -22,8 +23,6 @@ pub const JOB_STATES_MAX: usize = 512;
 /// What jobs are judged by.
 #[derive(Debug, Clone, Copy)]
 pub struct Rules {
-    /// How far states are apart.
-    pub metric: Metric,
     /// A trajectory stops this near to a known state (m).
     pub tolerance_m: f32,
     /// Longest way from the start (frames).
@@ -41,10 +40,16 @@ pub struct Context<'a> {
     pub plan: &'a Plan,
     /// All states so far.
     pub states: &'a StateFile,
+    /// Finds similar states.
+    pub similar: &'a Similar,
+    /// Tells a state's class.
+    pub classifier: &'a Classifier,
     /// Interior states of the snapshot by pose, by id.
     pub known: &'a [Vec<StateId>],
     /// How to judge.
     pub rules: &'a Rules,
+    /// Whether a job that failed is run once more: the simulator may recover.
+    pub retries: bool,
     /// Set when jobs are to be dropped.
     pub abandon: &'a AtomicBool,
 }
@@ -65,8 +70,10 @@ pub struct LocalFrame {
     pub parent: Local,
     /// Along which edge.
     pub edge: EdgeId,
-    /// For a dead end of an expansion: the most similar interior state and its distance (m).
-    pub merge: Option<(Local, f32)>,
+    /// Class of the state at its end.
+    pub class: Class,
+    /// For a dead end of an expansion: the most similar interior state.
+    pub merge: Option<Found<Local>>,
 }
 
 /// What a job found, chain by chain.
@@ -102,32 +109,6 @@ pub enum JobError {
     Abandoned,
 }
 
-/// The interior state nearest to `state` among `candidates` that is at most `bound_m` away; of
-/// equals the lowest id. Its distance is in metres.
-///
-/// # Errors
-/// A candidate could not be read.
-pub fn nearest(
-    states: &StateFile,
-    metric: &Metric,
-    state: &GridState,
-    candidates: &[StateId],
-    bound_m: f32,
-) -> io::Result<Option<(StateId, f32)>> {
-    let mut best: Option<(StateId, f32)> = None;
-    for &candidate in candidates {
-        let bound_m = best.map_or(bound_m, |(_, error_m)| error_m);
-        let other = states.read(candidate)?;
-        if let Some(error_m) = metric.distance_within(state, &other, bound_m) {
-            let better = |(id, least_m): (StateId, f32)| (error_m, candidate) < (least_m, id);
-            if best.is_none_or(better) {
-                best = Some((candidate, error_m));
-            }
-        }
-    }
-    Ok(best)
-}
-
 /// Runs a job of the initial pass from the state of its start pose.
 ///
 /// # Errors
@@ -150,10 +131,11 @@ pub fn initial(
         };
         let depth = outcome.states.len() as u32;
         let state = simulate(context, simulator, state, (edge, depth), &mut outcome.quality)?;
+        let class = context.classifier.class(context.primary.edge(edge).to, &state);
         if context.plan.is_tree(edge) {
             places.push((context.primary.edge(edge).to, depth));
         }
-        outcome.frames.push(LocalFrame { parent, edge, merge: None });
+        outcome.frames.push(LocalFrame { parent, edge, class, merge: None });
         outcome.states.push(state);
     }
     Ok(outcome)
@@ -170,12 +152,14 @@ pub fn expand(
     start: StateId,
     start_pose: PoseId,
 ) -> Result<Outcome, JobError> {
+    let state = context.states.read(start)?;
     let root = Node {
         parent: None,
         edge: EdgeId(0),
         pose: start_pose,
         depth: 0,
-        state: context.states.read(start)?,
+        class: context.classifier.class(start_pose, &state),
+        state,
         interior: true,
     };
     let mut tree = Tree { start, nodes: vec![root], quality: FrameQuality::default() };
@@ -205,6 +189,7 @@ struct Node {
     edge: EdgeId,
     pose: PoseId,
     depth: u32,
+    class: Class,
     state: GridState,
     interior: bool,
 }
@@ -231,7 +216,8 @@ impl Tree {
         let state = simulate(context, simulator, &from.state, (edge, depth), &mut self.quality)?;
         let pose = context.primary.edge(edge).to;
         let parent = Some(parent);
-        self.nodes.push(Node { parent, edge, pose, depth, state, interior: false });
+        let class = context.classifier.class(pose, &state);
+        self.nodes.push(Node { parent, edge, pose, depth, class, state, interior: false });
         Ok(self.nodes.len() - 1)
     }
 
@@ -249,20 +235,24 @@ impl Tree {
         context: &Context<'_>,
         node: usize,
         bound_m: f32,
-    ) -> io::Result<Option<(Target, f32)>> {
-        let Node { pose, state, .. } = &self.nodes[node];
-        let metric = &context.rules.metric;
+    ) -> io::Result<Option<Found<Target>>> {
+        let Node { pose, class, state, .. } = &self.nodes[node];
+        let similar = context.similar;
         let known = &context.known[pose.index()];
-        let mut best = nearest(context.states, metric, state, known, bound_m)?
-            .map(|(id, error_m)| (Target::Known(id), error_m));
+        let known = similar.nearest(context.states, (state, *class), known, bound_m)?;
+        let mut best = known.map(|found| found.of(Target::Known(found.target)));
         for (own, other) in self.nodes.iter().enumerate() {
             if !other.interior || other.pose != *pose || own == node {
                 continue;
             }
-            let bound_m = best.map_or(bound_m, |(_, error_m)| error_m);
-            let error_m = metric.distance_within(state, &other.state, bound_m);
-            if let Some(error_m) = error_m.filter(|e| best.is_none_or(|(_, least)| *e < least)) {
-                best = Some((Target::Node(own), error_m));
+            let bound_m = best.map_or(bound_m, |found| found.cost_m);
+            let penalty_m = similar.penalties().of(*class, other.class);
+            let Some((error_m, cost_m)) = similar.judge((state, &other.state), penalty_m, bound_m)
+            else {
+                continue;
+            };
+            if best.is_none_or(|found| cost_m < found.cost_m) {
+                best = Some(Found { target: Target::Node(own), error_m, cost_m });
             }
         }
         Ok(best)
@@ -306,18 +296,17 @@ impl Tree {
             let merge = if self.nodes[node].interior {
                 None
             } else {
-                let (target, error_m) = self
+                let found = self
                     .most_similar(context, node, f32::INFINITY)?
                     .expect("every pose has an interior state since the initial pass");
-                let target = match target {
+                Some(found.of(match found.target {
                     Target::Known(id) => Local::Known(id),
                     Target::Node(own) => place[own],
-                };
-                Some((target, error_m))
+                }))
             };
-            let Node { parent, edge, .. } = self.nodes[node];
+            let Node { parent, edge, class, .. } = self.nodes[node];
             let parent = place[parent.expect("only the start has no parent")];
-            outcome.frames.push(LocalFrame { parent, edge, merge });
+            outcome.frames.push(LocalFrame { parent, edge, class, merge });
         }
         for &node in &order {
             let empty = GridState { positions: Vec::new(), velocities: Vec::new() };

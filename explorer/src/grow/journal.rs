@@ -83,14 +83,44 @@ impl Journal {
             return Err(JournalError::Foreign.into());
         }
         let mut journal = Self { file, path: path.to_owned(), end: MAGIC.len() as u64 };
-        while let Some(payload) = journal.payload(journal.end, length).map_err(io)? {
-            let at = journal.end;
-            let record = postcard::from_bytes(&payload).map_err(|_| JournalError::Unknown(at))?;
-            each(record)?;
-            journal.end += (LENGTH_BYTES + payload.len() + CHECK_BYTES) as u64;
-        }
+        journal.replay(length, &mut each)?;
         let torn = journal.cut_tail(length)?;
         Ok((journal, torn))
+    }
+
+    /// Hands every whole record to `each`, in order, and changes nothing: an explorer may be
+    /// writing.
+    ///
+    /// # Errors
+    /// As for [`Journal::open`]; a damaged record is taken for one that is being written.
+    pub fn read<E: From<JournalError>>(
+        path: &Path,
+        mut each: impl FnMut(Record) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let io = |error| E::from(JournalError::Io(error));
+        let file = File::open(path).map_err(io)?;
+        let length = file.metadata().map_err(io)?.len();
+        let mut magic = [0; MAGIC.len()];
+        if files::read_at(&file, &mut magic, 0).is_err() || &magic != MAGIC {
+            return Err(JournalError::Foreign.into());
+        }
+        let mut journal = Self { file, path: path.to_owned(), end: MAGIC.len() as u64 };
+        journal.replay(length, &mut each)
+    }
+
+    fn replay<E: From<JournalError>>(
+        &mut self,
+        length: u64,
+        each: &mut impl FnMut(Record) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let io = |error| E::from(JournalError::Io(error));
+        while let Some(payload) = self.payload(self.end, length).map_err(io)? {
+            let at = self.end;
+            let record = postcard::from_bytes(&payload).map_err(|_| JournalError::Unknown(at))?;
+            each(record)?;
+            self.end += (LENGTH_BYTES + payload.len() + CHECK_BYTES) as u64;
+        }
+        Ok(())
     }
 
     /// Appends a record and waits until it is on the disk.

@@ -9,8 +9,10 @@ use std::sync::Arc;
 
 use protocol::{PoseId, StateId};
 
+use super::class::Penalties;
 use super::graph::{Graph, GraphError, Kind};
 use super::plan::Plan;
+use super::policy::Steering;
 use super::record::{FailedRecord, JobRecord, MergeRecord, PublishRecord, Record};
 use crate::primary::PrimaryGraph;
 use crate::scene::Scene;
@@ -84,6 +86,7 @@ pub struct Ledger {
     set_aside: BTreeSet<StateId>,
     quality: FrameQuality,
     published: Option<PublishRecord>,
+    steering: Steering,
 }
 
 impl Ledger {
@@ -94,7 +97,11 @@ impl Ledger {
         let mut placed = vec![None; primary.poses().len()];
         placed[scene.start.index()] = Some(StateId(0));
         Self {
-            graph: Graph::new(Arc::clone(primary), scene.start),
+            graph: Graph::with_penalties(
+                Arc::clone(primary),
+                scene.start,
+                Penalties::new(&scene.metric.classes),
+            ),
             planned_done: vec![false; plan.jobs().len()],
             plan: Arc::new(plan),
             round_jobs: scene.exploration.round_jobs.max(1) as usize,
@@ -104,6 +111,7 @@ impl Ledger {
             set_aside: BTreeSet::new(),
             quality: FrameQuality::default(),
             published: None,
+            steering: Steering::new(primary),
         }
     }
 
@@ -130,6 +138,11 @@ impl Ledger {
     /// Dead ends whose job was given up: they stay merged and are not chosen again.
     pub fn set_aside(&self) -> &BTreeSet<StateId> {
         &self.set_aside
+    }
+
+    /// What jobs are chosen by.
+    pub fn steering(&self) -> &Steering {
+        &self.steering
     }
 
     /// The last version known to be in the store.
@@ -171,7 +184,7 @@ impl Ledger {
         assert!(self.round.is_done(), "the round before is not done");
         let jobs = match self.phase() {
             Phase::Initial => self.ready(),
-            Phase::Expansion => self.largest(),
+            Phase::Expansion => self.expansions(),
             Phase::Drape | Phase::Merge => Vec::new(),
         };
         if jobs.is_empty() {
@@ -189,9 +202,10 @@ impl Ledger {
     pub fn apply(&mut self, record: &Record) -> Result<(), LedgerError> {
         match record {
             Record::Header(_) => Err(LedgerError::OutOfTurn("the header")),
-            Record::Drape(quality) if !self.draped => {
+            Record::Drape(drape) if !self.draped => {
                 self.draped = true;
-                self.quality.add(quality);
+                self.graph.classify_drape(drape.class);
+                self.quality.add(&drape.quality);
                 Ok(())
             }
             Record::Drape(_) => Err(LedgerError::OutOfTurn("the drape")),
@@ -200,6 +214,11 @@ impl Ledger {
             Record::Initialised(merges) => self.apply_initial_merges(merges),
             Record::Published(version) => {
                 self.published = Some(*version);
+                Ok(())
+            }
+            Record::Steer(_) if !self.round.is_done() => Err(LedgerError::OutOfTurn("a policy")),
+            Record::Steer(steer) => {
+                self.steering.steer(steer);
                 Ok(())
             }
         }
@@ -216,11 +235,12 @@ impl Ledger {
         ready.into_iter().take(self.round_jobs).map(Job::Initial).collect()
     }
 
-    /// Dead ends with the largest merge errors above 0.
-    fn largest(&self) -> Vec<Job> {
-        let queue = self.graph.queue().iter().take_while(|(_, error_m)| *error_m > 0.0);
-        let free = queue.filter(|(state, _)| !self.set_aside.contains(state));
-        free.take(self.round_jobs).map(|(state, _)| Job::Expand(state)).collect()
+    /// Dead ends to be expanded, by the policy.
+    fn expansions(&mut self) -> Vec<Job> {
+        let set_aside = &self.set_aside;
+        let free = |state: StateId| !set_aside.contains(&state);
+        let chosen = self.steering.choose(&self.graph, self.round_jobs, &free);
+        chosen.into_iter().map(Job::Expand).collect()
     }
 
     /// The job whose turn it is, if it is the one that was recorded.
@@ -258,7 +278,7 @@ impl Ledger {
             return Err(LedgerError::OutOfTurn("other edges than planned"));
         }
         for frame in &record.frames {
-            let state = self.graph.attach(frame.parent, frame.edge)?;
+            let state = self.graph.attach_class(frame.parent, frame.edge, frame.class)?;
             if plan.is_tree(frame.edge) {
                 self.placed[self.graph.state(state).pose.index()] = Some(state);
             }
@@ -279,10 +299,14 @@ impl Ledger {
     }
 
     fn apply_expansion(&mut self, start: StateId, job: &JobRecord) -> Result<(), LedgerError> {
-        self.graph.revert(start)?;
+        let undone = self.graph.revert(start)?;
+        if let Some(future_m) = job.future_m {
+            let pose = self.graph.state(start).pose;
+            self.steering.learn(&self.graph, pose, undone.error_m, future_m);
+        }
         let first = self.graph.next_id().0;
         for frame in &job.frames {
-            self.graph.attach(frame.parent, frame.edge)?;
+            self.graph.attach_class(frame.parent, frame.edge, frame.class)?;
         }
         let new = || job.frames.iter().zip(first..).map(|(frame, id)| (frame, StateId(id)));
         self.graph.close(start)?;

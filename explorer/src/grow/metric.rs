@@ -1,26 +1,62 @@
 //! How far two cloth states are from each other.
 
 use crate::grid::{GridState, POSITION_STEP_M, VELOCITY_STEP_M_S};
+use crate::scene::{Norm, Scene};
 
 /// Vertices compared between two looks at the bound: long enough to vectorise, short enough that
 /// most candidates are given up after one block.
 const BLOCK: usize = 64;
 
-/// L-infinity over vertices of `max(|dp|, velocity_time_s * |dv|)`, in metres.
+/// How far two states of one mesh are apart, in metres.
 ///
-/// `|.|` is the Euclidean length of a vertex's displacement. The grid makes both maxima exact
-/// integers, so that the distance is symmetric, zero only for equal states, never NaN, and does
-/// not depend on the order of vertices. Source: Kim et al. 2013, sections 3.2 and 5.1.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// A vertex contributes its weight times `max(|dp|, velocity_time_s * |dv|)` to
+/// [`Norm::Largest`], and times `sqrt(|dp|^2 + (velocity_time_s * |dv|)^2)` to [`Norm::Rms`];
+/// `|.|` is Euclidean. Without weights the grid makes maxima and sums exact integers. Whatever the
+/// settings, the distance is symmetric, zero for equal states and never NaN. Source: Kim et al.
+/// 2013, sections 3.2, 3.3 and 5.1.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Metric {
+    norm: Norm,
     velocity_time_s: f64,
+    /// Squares of the vertices' weights; empty where all are 1.
+    weights: Vec<f64>,
+}
+
+/// What was summed over some vertices, in squared steps.
+#[derive(Debug, Clone, Copy, Default)]
+struct Total {
+    position: u64,
+    velocity: u64,
+    /// With weights: the largest or the sum, in squared metres.
+    weighted_m2: f64,
 }
 
 impl Metric {
-    /// `velocity_time_s`: how far ahead a difference of velocity counts (s), finite and >= 0.
+    /// The plain metric of the paper.
+    ///
+    /// * `velocity_time_s`: how far ahead a difference of velocity counts (s), finite and >= 0.
     pub fn new(velocity_time_s: f32) -> Self {
         assert!(velocity_time_s.is_finite() && velocity_time_s >= 0.0);
-        Self { velocity_time_s: f64::from(velocity_time_s) }
+        let velocity_time_s = f64::from(velocity_time_s);
+        Self { norm: Norm::Largest, velocity_time_s, weights: Vec::new() }
+    }
+
+    /// A scene's metric.
+    pub fn of_scene(scene: &Scene) -> Self {
+        let settings = &scene.metric;
+        let weights = settings.weights.iter().map(|w| f64::from(*w).powi(2)).collect();
+        Self { norm: settings.norm, weights, ..Self::new(scene.exploration.velocity_time_s) }
+    }
+
+    /// The metric between the same states cut down to these vertices, for
+    /// [`Metric::least_distance`].
+    pub fn of_vertices(&self, vertices: &[u32]) -> Self {
+        let weight = |v: &u32| self.weights[*v as usize];
+        let weights = match self.weights.is_empty() {
+            true => Vec::new(),
+            false => vertices.iter().map(weight).collect(),
+        };
+        Self { weights, ..self.clone() }
     }
 
     /// The distance of two states of the same mesh (m).
@@ -32,40 +68,117 @@ impl Metric {
     /// vertices were looked at.
     pub fn distance_within(&self, a: &GridState, b: &GridState, bound_m: f32) -> Option<f32> {
         assert_eq!(a.vertex_count(), b.vertex_count(), "states of different meshes");
-        let (position_limit, velocity_limit) = self.limits(bound_m);
-        let (mut position, mut velocity) = (0u64, 0u64);
+        let (count, mut total) = (a.vertex_count(), Total::default());
         let positions = a.positions.chunks(BLOCK).zip(b.positions.chunks(BLOCK));
         let velocities = a.velocities.chunks(BLOCK).zip(b.velocities.chunks(BLOCK));
-        for ((pa, pb), (va, vb)) in positions.zip(velocities) {
-            position = position.max(squared_max(pa, pb));
-            velocity = velocity.max(squared_max(va, vb));
-            if position > position_limit || velocity > velocity_limit {
+        for (block, (p, v)) in positions.zip(velocities).enumerate() {
+            self.add(&mut total, block * BLOCK, p, v);
+            if self.metres(&total, count) > bound_m {
                 return None;
             }
         }
-        let distance_m = self.metres(position, velocity);
+        let distance_m = self.metres(&total, count);
         (distance_m <= bound_m).then_some(distance_m)
     }
 
-    fn metres(&self, position_squared: u64, velocity_squared: u64) -> f32 {
-        let position_m = (position_squared as f64).sqrt() * f64::from(POSITION_STEP_M);
-        let velocity_m = (velocity_squared as f64).sqrt()
-            * (f64::from(VELOCITY_STEP_M_S) * self.velocity_time_s);
-        position_m.max(velocity_m) as f32
+    /// What two rows of some of the mesh's vertices say about the distance of the whole states: it
+    /// is at least this (m). `count`: vertices of the whole.
+    ///
+    /// * `a`, `b`: per vertex its position's and its velocity's three components (steps).
+    pub fn least_distance(&self, a: &[[i16; 6]], b: &[[i16; 6]], count: usize) -> f32 {
+        let mut total = Total::default();
+        if self.weights.is_empty() {
+            for (a, b) in a.iter().zip(b) {
+                let (p, v) = (squared(&a[..3], &b[..3]), squared(&a[3..], &b[3..]));
+                self.join(&mut total, p, v);
+            }
+            return self.metres(&total, count);
+        }
+        for ((a, b), weight) in a.iter().zip(b).zip(&self.weights) {
+            let (p, v) = (squared(&a[..3], &b[..3]), squared(&a[3..], &b[3..]));
+            self.join_weighted(&mut total, (p, v), *weight);
+        }
+        // Another order of summation than in the whole: a bound must not be above.
+        self.metres(&total, count) * (1.0 - 1e-6)
     }
 
-    /// Squared steps above which the distance is certainly above the bound. Generous by a few
-    /// parts in a million, so that rounding decides nothing here.
-    fn limits(&self, bound_m: f32) -> (u64, u64) {
-        let limit = |step: f64| {
-            let steps = f64::from(bound_m) / step * (1.0 + 1e-6) + 1.0;
-            // A cast saturates: infinity, also from a step of zero, means no limit.
-            (steps * steps) as u64
-        };
-        let velocity_step = f64::from(VELOCITY_STEP_M_S) * self.velocity_time_s;
-        let velocity = if velocity_step > 0.0 { limit(velocity_step) } else { u64::MAX };
-        (limit(f64::from(POSITION_STEP_M)), velocity)
+    fn add(
+        &self,
+        total: &mut Total,
+        first: usize,
+        (pa, pb): (&[[i16; 3]], &[[i16; 3]]),
+        (va, vb): (&[[i16; 3]], &[[i16; 3]]),
+    ) {
+        if !self.weights.is_empty() {
+            let pairs = pa.iter().zip(pb).zip(va.iter().zip(vb));
+            for (((pa, pb), (va, vb)), weight) in pairs.zip(&self.weights[first..]) {
+                self.join_weighted(total, (squared(pa, pb), squared(va, vb)), *weight);
+            }
+            return;
+        }
+        match self.norm {
+            Norm::Largest => {
+                total.position = total.position.max(squared_max(pa, pb));
+                total.velocity = total.velocity.max(squared_max(va, vb));
+            }
+            Norm::Rms => {
+                total.position += pa.iter().zip(pb).map(|(a, b)| squared(a, b)).sum::<u64>();
+                total.velocity += va.iter().zip(vb).map(|(a, b)| squared(a, b)).sum::<u64>();
+            }
+        }
     }
+
+    fn join(&self, total: &mut Total, position: u64, velocity: u64) {
+        match self.norm {
+            Norm::Largest => {
+                total.position = total.position.max(position);
+                total.velocity = total.velocity.max(velocity);
+            }
+            Norm::Rms => {
+                total.position += position;
+                total.velocity += velocity;
+            }
+        }
+    }
+
+    fn join_weighted(&self, total: &mut Total, (position, velocity): (u64, u64), weight: f64) {
+        let [position, velocity] = self.squared_metres(position, velocity);
+        match self.norm {
+            Norm::Largest => {
+                let here = weight * position.max(velocity);
+                total.weighted_m2 = total.weighted_m2.max(here);
+            }
+            Norm::Rms => total.weighted_m2 += weight * (position + velocity),
+        }
+    }
+
+    /// Squared steps as squared metres.
+    fn squared_metres(&self, position: u64, velocity: u64) -> [f64; 2] {
+        let position_step = f64::from(POSITION_STEP_M);
+        let velocity_step = f64::from(VELOCITY_STEP_M_S) * self.velocity_time_s;
+        [
+            position as f64 * (position_step * position_step),
+            velocity as f64 * (velocity_step * velocity_step),
+        ]
+    }
+
+    /// `count`: vertices of the whole state.
+    fn metres(&self, total: &Total, count: usize) -> f32 {
+        let [position, velocity] = self.squared_metres(total.position, total.velocity);
+        let squared = match self.norm {
+            Norm::Largest => position.max(velocity).max(total.weighted_m2),
+            Norm::Rms => (position + velocity + total.weighted_m2) / count.max(1) as f64,
+        };
+        squared.sqrt() as f32
+    }
+}
+
+fn squared(a: &[i16], b: &[i16]) -> u64 {
+    let axis = |axis: usize| {
+        let d = i64::from(a[axis]) - i64::from(b[axis]);
+        (d * d) as u64
+    };
+    axis(0) + axis(1) + axis(2)
 }
 
 /// Largest squared length of the differences, in squared steps.
@@ -88,18 +201,32 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn plain(a: &GridState, b: &GridState, velocity_time_s: f64) -> f64 {
+    fn plain(a: &GridState, b: &GridState, metric: &Metric) -> f64 {
         let length = |d: cloth::Vec3| {
             let [x, y, z] = d.to_array().map(f64::from);
             (x * x + y * y + z * z).sqrt()
         };
-        let mut worst = 0.0f64;
+        let (mut worst, mut sum) = (0.0f64, 0.0);
         for v in 0..a.vertex_count() {
             let dp = length(a.position(v) - b.position(v));
-            let dv = length(a.velocity(v) - b.velocity(v));
-            worst = worst.max(dp).max(velocity_time_s * dv);
+            let dv = metric.velocity_time_s * length(a.velocity(v) - b.velocity(v));
+            let weight = metric.weights.get(v).map_or(1.0, |square| square.sqrt());
+            worst = worst.max(weight * dp.max(dv));
+            sum += weight * weight * (dp * dp + dv * dv);
         }
-        worst
+        match metric.norm {
+            Norm::Largest => worst,
+            Norm::Rms => (sum / a.vertex_count() as f64).sqrt(),
+        }
+    }
+
+    fn rows(state: &GridState, vertices: &[u32]) -> Vec<[i16; 6]> {
+        let row = |v: &u32| {
+            let ([a, b, c], [d, e, f]) =
+                (state.positions[*v as usize], state.velocities[*v as usize]);
+            [a, b, c, d, e, f]
+        };
+        vertices.iter().map(row).collect()
     }
 
     fn state(vertices: usize) -> impl Strategy<Value = GridState> {
@@ -113,12 +240,18 @@ mod tests {
 
     proptest! {
         #[test]
-        fn agrees_with_a_plain_loop_and_with_its_bound(
+        fn agrees_with_a_plain_loop_and_with_its_bounds(
             a in state(70), b in state(70), time in 0.0f32..0.2, share in 0.0f32..2.0,
+            rms in any::<bool>(), weighted in any::<bool>(),
         ) {
-            let metric = Metric::new(time);
+            let weights = (0..70).map(|v| f64::from(v % 5) * 0.25).collect();
+            let metric = Metric {
+                norm: if rms { Norm::Rms } else { Norm::Largest },
+                weights: if weighted { weights } else { Vec::new() },
+                ..Metric::new(time)
+            };
             let distance = metric.distance(&a, &b);
-            let reference = plain(&a, &b, f64::from(time));
+            let reference = plain(&a, &b, &metric);
             prop_assert!((f64::from(distance) - reference).abs() <= 1e-6 * reference.max(1e-3));
             prop_assert_eq!(distance.to_bits(), metric.distance(&b, &a).to_bits());
             prop_assert_eq!(metric.distance(&a, &a), 0.0);
@@ -126,6 +259,12 @@ mod tests {
             let within = (distance <= bound).then_some(distance);
             prop_assert_eq!(metric.distance_within(&a, &b, bound), within);
             prop_assert_eq!(metric.distance_within(&a, &b, distance), Some(distance));
+            for vertices in [&[3u32, 69, 7][..], &(0..70).collect::<Vec<_>>()] {
+                let few = metric.of_vertices(vertices);
+                let least = few.least_distance(&rows(&a, vertices), &rows(&b, vertices), 70);
+                prop_assert!(least <= distance, "{least} > {distance}");
+                prop_assert!(vertices.len() < 70 || least >= distance * (1.0 - 1e-5));
+            }
         }
     }
 

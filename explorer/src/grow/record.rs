@@ -3,7 +3,9 @@
 use protocol::{EdgeId, StateId, VersionNumber};
 use serde::{Deserialize, Serialize};
 
-use crate::scene::Scene;
+use super::class::Class;
+use super::policy::Policy;
+use crate::scene::{Norm, Scene};
 use crate::simulator::FrameQuality;
 
 /// Version of the journal's records and of the state file.
@@ -15,7 +17,7 @@ pub enum Record {
     /// The first record: what the folder was made for.
     Header(Header),
     /// State 0 was draped on the start pose.
-    Drape(FrameQuality),
+    Drape(DrapeRecord),
     /// A job's outcome.
     Job(JobRecord),
     /// A job was given up; its dead end stays merged.
@@ -25,6 +27,30 @@ pub enum Record {
     /// A version is in the store. Not written if the process is killed just after publishing: then
     /// the version is published again, which makes no other of it.
     Published(PublishRecord),
+    /// From the next round on, jobs are chosen by this.
+    Steer(SteerRecord),
+}
+
+/// The drape.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DrapeRecord {
+    /// Measures of its last frame.
+    pub quality: FrameQuality,
+    /// Class of state 0.
+    pub class: Class,
+}
+
+/// What jobs are chosen by; see [`super::policy`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SteerRecord {
+    /// The policy.
+    pub policy: Policy,
+    /// Only dead ends in these clips are simulated, if any are named.
+    pub clips: Vec<u16>,
+    /// The newest batch of telemetry that was taken in; 0 for none.
+    pub telemetry: u64,
+    /// Traversals counted since the record before, by edge.
+    pub counts: Vec<(EdgeId, u64)>,
 }
 
 /// Everything that decides what a folder's graph becomes.
@@ -53,6 +79,9 @@ pub struct JobRecord {
     pub remerges: Vec<MergeRecord>,
     /// Measures of its frames.
     pub quality: FrameQuality,
+    /// Of an expansion: the largest distance (m), over the first frames, between what was
+    /// simulated and what had been played instead.
+    pub future_m: Option<f32>,
 }
 
 /// A simulated frame.
@@ -62,6 +91,8 @@ pub struct FrameRecord {
     pub parent: StateId,
     /// Along which edge.
     pub edge: EdgeId,
+    /// Class of the state at its end.
+    pub class: Class,
     /// For a dead end: where it was merged and at which distance (m).
     pub merge: Option<(StateId, f32)>,
 }
@@ -118,10 +149,17 @@ impl Header {
             text("drape_frames", e.drape_frames.to_string()),
             text("rank_max", e.rank_max.to_string()),
             text("ground", e.ground.to_string()),
+            text("metric", metric(scene)),
+            text("classes", digest(&classes(scene))),
             text("--paper", paper.to_string()),
         ];
         let vertex_count = scene.garment.positions.len() as u32;
         Self { format: FORMAT_VERSION, vertex_count, inputs }
+    }
+
+    /// Whether `--paper` was given.
+    pub fn paper(&self) -> bool {
+        self.inputs.iter().any(|(name, value)| name == "--paper" && value == "true")
     }
 
     /// Names the inputs that differ, with both values; `None` where there is none.
@@ -215,6 +253,29 @@ fn garment(scene: &Scene) -> Hasher {
                 .into_iter()
                 .chain(f.weft),
         )
+}
+
+/// The norm, and a digest of the weights where there are any.
+fn metric(scene: &Scene) -> String {
+    let norm = match scene.metric.norm {
+        Norm::Largest => "largest",
+        Norm::Rms => "rms",
+    };
+    match &scene.metric.weights[..] {
+        [] => norm.into(),
+        weights => format!("{norm} {}", digest(&Hasher::new().floats(weights.iter().copied()))),
+    }
+}
+
+fn classes(scene: &Scene) -> Hasher {
+    scene.metric.classes.iter().fold(Hasher::new(), |hasher, rule| {
+        hasher
+            .integers([u64::from(rule.joint), u64::from(rule.implausible[0])])
+            .integers([u64::from(rule.implausible[1])])
+            .integers(rule.vertices.iter().map(|v| u64::from(*v)))
+            .floats(rule.axis.to_array())
+            .floats([rule.threshold_m, rule.penalty_m])
+    })
 }
 
 #[cfg(test)]

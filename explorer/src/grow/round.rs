@@ -53,6 +53,7 @@ pub fn run(
     let round = work.ledger().round().clone();
     let states = Arc::clone(work.states());
     let rules = *work.rules();
+    let (similar, classifier) = (Arc::clone(work.similar()), Arc::clone(work.classifier()));
     let plan = Arc::clone(work.ledger().plan());
     let primary = Arc::clone(work.graph().primary());
     let known = work.ledger().interior_at(round.snapshot);
@@ -61,9 +62,12 @@ pub fn run(
         primary: &primary,
         plan: &plan,
         states: &states,
+        similar: &similar,
+        classifier: &classifier,
         known: &known,
         rules: &rules,
         abandon: &abandon,
+        retries: simulators.iter().any(|simulator| simulator.may_recover()),
     };
     let starts = starts(work);
     let next = AtomicUsize::new(round.done);
@@ -113,12 +117,16 @@ fn worker(
         let place = next.fetch_add(1, Ordering::Relaxed);
         let Some(Some((job, state, pose))) = starts.get(place) else { return };
         let clock = CpuClock::start();
-        let outcome = match job {
+        let mut run = || match job {
             Job::Initial(planned) => {
                 job::initial(context, simulator, &context.plan.jobs()[*planned], *state)
             }
             Job::Expand(_) => job::expand(context, simulator, *state, *pose),
         };
+        let mut outcome = run();
+        if matches!(outcome, Err(JobError::Simulate { .. })) && context.retries {
+            outcome = run();
+        }
         if sender.send((place, outcome, clock.elapsed_s())).is_err() {
             return;
         }

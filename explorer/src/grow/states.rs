@@ -52,6 +52,25 @@ impl StateFile {
         states: u64,
     ) -> io::Result<Self> {
         let file = File::options().read(true).write(true).open(path)?;
+        let file = Self::check(file, vertex_count, digest, states)?;
+        file.file.set_len(file.offset(StateId(states)))?;
+        Ok(file)
+    }
+
+    /// As [`StateFile::open`], for reading only: an explorer may be at work in the folder.
+    ///
+    /// # Errors
+    /// As for [`StateFile::open`].
+    pub fn open_to_read(
+        path: &Path,
+        vertex_count: u32,
+        digest: &[u8; 32],
+        states: u64,
+    ) -> io::Result<Self> {
+        Self::check(File::open(path)?, vertex_count, digest, states)
+    }
+
+    fn check(file: File, vertex_count: u32, digest: &[u8; 32], states: u64) -> io::Result<Self> {
         let mut found = [0; HEADER_BYTES];
         files::read_at(&file, &mut found, 0)?;
         if found != header(vertex_count, digest) {
@@ -64,7 +83,6 @@ impl StateFile {
             let text = format!("{length} bytes long, but the journal speaks of {needed}");
             return Err(io::Error::other(text));
         }
-        file.file.set_len(needed)?;
         Ok(file)
     }
 
@@ -73,11 +91,33 @@ impl StateFile {
         self.vertex_count
     }
 
+    /// Bytes of a state.
+    pub fn state_bytes(&self) -> u64 {
+        (self.vertex_count * VERTEX_BYTES) as u64
+    }
+
     /// Writes consecutive states and waits until they are on the disk.
     ///
     /// # Errors
     /// They cannot be written.
     pub fn write(&self, first: StateId, states: &[GridState]) -> io::Result<()> {
+        self.write_unsynced(first, states)?;
+        self.sync()
+    }
+
+    /// Waits until all that was written is on the disk.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn sync(&self) -> io::Result<()> {
+        self.file.sync_data()
+    }
+
+    /// As [`StateFile::write`], without waiting.
+    ///
+    /// # Errors
+    /// They cannot be written.
+    pub fn write_unsynced(&self, first: StateId, states: &[GridState]) -> io::Result<()> {
         let mut bytes = Vec::with_capacity(states.len() * self.vertex_count * VERTEX_BYTES);
         for state in states {
             assert_eq!(state.vertex_count(), self.vertex_count, "a state of another mesh");
@@ -85,8 +125,7 @@ impl StateFile {
                 row.iter().for_each(|step| bytes.extend_from_slice(&step.to_le_bytes()));
             }
         }
-        files::write_at(&self.file, &bytes, self.offset(first))?;
-        self.file.sync_data()
+        files::write_at(&self.file, &bytes, self.offset(first))
     }
 
     /// Reads a state.

@@ -8,7 +8,7 @@ use protocol::{EdgeId, PoseId};
 
 use crate::grid::GridState;
 use crate::primary::{PrimaryEdge, PrimaryGraph, PrimaryPose};
-use crate::scene::{ExplorationSettings, Fabric, Garment, Scene};
+use crate::scene::{ExplorationSettings, Fabric, Garment, MetricSettings, Scene};
 use crate::simulator::{Frame, FrameQuality, SimulateError, Simulator, SimulatorFactory};
 
 pub fn primary(poses: u32, edges: &[(u32, u32)]) -> PrimaryGraph {
@@ -78,6 +78,7 @@ pub fn scene(primary: PrimaryGraph, exploration: ExplorationSettings) -> Scene {
         start: PoseId(0),
         garment,
         exploration,
+        metric: MetricSettings::default(),
     }
 }
 

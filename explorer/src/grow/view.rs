@@ -32,6 +32,36 @@ pub struct View<'a> {
     commit: u64,
 }
 
+impl Graph {
+    /// What a state was at a commit at or after the end of the initial pass.
+    pub fn kind_at(&self, state: StateId, commit: u64) -> KindAt<'_> {
+        if state.0 >= self.moments()[commit as usize].states {
+            return KindAt::Later;
+        }
+        let entry = self.state(state);
+        if entry.interior_since.is_some_and(|since| since <= commit)
+            && let Kind::Interior { next } = &entry.kind
+        {
+            return KindAt::Interior(next);
+        }
+        let merge = entry.merges.iter().rev().find(|merge| merge.commit <= commit);
+        let merge = merge.expect("a state of a total graph is interior or merged");
+        KindAt::DeadEnd(merge.target, merge.error_m)
+    }
+
+    /// Interior states of a pose at a commit.
+    pub fn interior_at(&self, pose: protocol::PoseId, commit: u64) -> &[StateId] {
+        let all = self.interior(pose);
+        let since = |id: &StateId| self.state(*id).interior_since;
+        &all[..all.partition_point(|id| since(id).is_some_and(|since| since <= commit))]
+    }
+
+    /// The job that made a state, as the commit that recorded it.
+    pub fn commit_of(&self, state: StateId) -> u64 {
+        self.moments().partition_point(|moment| moment.states <= state.0) as u64
+    }
+}
+
 impl<'a> View<'a> {
     /// The graph as it was after `commit`, which must not lie before the end of the initial pass.
     pub fn new(graph: &'a Graph, states: &'a StateFile, commit: u64) -> Self {
@@ -42,23 +72,26 @@ impl<'a> View<'a> {
 
     /// What a state was at that commit.
     pub fn kind(&self, state: StateId) -> KindAt<'a> {
-        let graph: &'a Graph = self.graph;
-        if state.0 >= graph.moments()[self.commit as usize].states {
-            return KindAt::Later;
-        }
-        let entry = graph.state(state);
-        if entry.interior_since.is_some_and(|since| since <= self.commit)
-            && let Kind::Interior { next } = &entry.kind
-        {
-            return KindAt::Interior(next);
-        }
-        let merge = entry.merges.iter().rev().find(|merge| merge.commit <= self.commit);
-        let merge = merge.expect("a state of a total graph is interior or merged");
-        KindAt::DeadEnd(merge.target, merge.error_m)
+        self.graph.kind_at(state, self.commit)
+    }
+
+    /// The graph, whose later states do not exist yet here.
+    pub fn graph(&self) -> &'a Graph {
+        self.graph
+    }
+
+    /// The commit.
+    pub fn commit(&self) -> u64 {
+        self.commit
+    }
+
+    /// How many states there were.
+    pub fn state_count(&self) -> u64 {
+        self.graph.moments()[self.commit as usize].states
     }
 
     /// The interior state that followed an interior one at that commit.
-    fn follow(&self, state: StateId, edge: EdgeId) -> StateId {
+    pub fn follow(&self, state: StateId, edge: EdgeId) -> StateId {
         let KindAt::Interior(next) = self.kind(state) else {
             unreachable!("state {state} is interior")
         };

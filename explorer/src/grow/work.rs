@@ -11,20 +11,25 @@ use std::sync::Arc;
 
 use protocol::StateId;
 
+use super::class::{Class, Classifier};
 use super::files;
 use super::graph::{Graph, Kind};
-use super::job::{self, Local, Outcome, Rules};
+use super::job::{Local, LocalFrame, Outcome, Rules};
 use super::journal::{Journal, JournalError};
 use super::ledger::{Job, Ledger, LedgerError};
-use super::metric::Metric;
 use super::record::{
-    FailedRecord, FrameRecord, Header, JobRecord, MergeRecord, PublishRecord, Record,
+    DrapeRecord, FailedRecord, FrameRecord, Header, JobRecord, MergeRecord, PublishRecord, Record,
+    SteerRecord,
 };
+use super::similar::{Found, Similar};
 use super::states::StateFile;
 use super::view::View;
 use crate::grid::GridState;
 use crate::scene::Scene;
 use crate::simulator::Frame;
+
+/// Frames behind a merge in which its true error is looked for.
+const FUTURE_FRAMES: usize = 10;
 
 /// Why a work folder cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -83,6 +88,8 @@ pub struct Work {
     ledger: Ledger,
     journal: Journal,
     states: Arc<StateFile>,
+    similar: Arc<Similar>,
+    classifier: Arc<Classifier>,
     rules: Rules,
     simulate_cpu: File,
     simulate_cpu_s: f64,
@@ -115,15 +122,18 @@ impl Work {
             let journal = Journal::create(&journal_path, &Record::Header(header));
             (journal.map_err(at(&journal_path))?, states)
         };
+        let mut similar = Similar::new(scene);
+        let classes = match ledger.phase() {
+            super::ledger::Phase::Drape => Vec::new(),
+            _ => ledger.graph().states().iter().map(|state| state.class).collect(),
+        };
+        let path = folder.join("landmarks");
+        similar.open(&path, &digest, &states, classes).map_err(at(&path))?;
         let cpu_path = folder.join("simulate_cpu_s");
         let (simulate_cpu, simulate_cpu_s) = open_cpu(&cpu_path).map_err(at(&cpu_path))?;
         let e = &scene.exploration;
-        let rules = Rules {
-            metric: Metric::new(e.velocity_time_s),
-            tolerance_m: e.tolerance_m,
-            depth_frames: e.depth_frames.max(1),
-            paper,
-        };
+        let rules =
+            Rules { tolerance_m: e.tolerance_m, depth_frames: e.depth_frames.max(1), paper };
         let states = Arc::new(states);
         let folder = folder.to_owned();
         Ok(Self {
@@ -131,6 +141,8 @@ impl Work {
             ledger,
             journal,
             states,
+            similar: Arc::new(similar),
+            classifier: Arc::new(Classifier::new(scene)),
             rules,
             simulate_cpu,
             simulate_cpu_s,
@@ -153,6 +165,16 @@ impl Work {
         &self.states
     }
 
+    /// Finds similar states.
+    pub fn similar(&self) -> &Arc<Similar> {
+        &self.similar
+    }
+
+    /// Tells a state's class.
+    pub fn classifier(&self) -> &Arc<Classifier> {
+        &self.classifier
+    }
+
     /// How jobs are judged.
     pub fn rules(&self) -> &Rules {
         &self.rules
@@ -161,6 +183,11 @@ impl Work {
     /// CPU seconds spent in jobs, over all runs; a killed run's last seconds may be missing.
     pub fn simulate_cpu_s(&self) -> f64 {
         self.simulate_cpu_s
+    }
+
+    /// Bytes of a state in this folder, its part of the journal included, about.
+    pub fn state_bytes(&self) -> u64 {
+        self.states.state_bytes() + 12 * super::similar::LANDMARKS as u64 + 24
     }
 
     /// The graph at a commit, ready to be published.
@@ -178,8 +205,18 @@ impl Work {
     /// # Errors
     /// The folder cannot be written.
     pub fn drape(&mut self, frame: &Frame) -> Result<(), WorkError> {
-        self.write_states(StateId(0), std::slice::from_ref(&frame.state))?;
-        self.record(&Record::Drape(frame.quality))
+        let pose = self.graph().state(StateId(0)).pose;
+        let class = self.classifier.class(pose, &frame.state);
+        self.write_states(StateId(0), std::slice::from_ref(&frame.state), &[class])?;
+        self.record(&Record::Drape(DrapeRecord { quality: frame.quality, class }))
+    }
+
+    /// From the next round on, jobs are chosen by this.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub fn steer(&mut self, steer: SteerRecord) -> Result<(), WorkError> {
+        self.record(&Record::Steer(steer))
     }
 
     /// Commits the outcome of the round's next job.
@@ -188,8 +225,9 @@ impl Work {
     /// The folder cannot be read or written.
     pub fn commit(&mut self, outcome: &Outcome) -> Result<(), WorkError> {
         let read = at(&self.folder.join("states"));
+        let classes: Vec<Class> = outcome.frames.iter().map(|frame| frame.class).collect();
+        self.write_states(self.graph().next_id(), &outcome.states, &classes)?;
         let record = self.job_record(outcome).map_err(read)?;
-        self.write_states(self.graph().next_id(), &outcome.states)?;
         self.record(&Record::Job(record))
     }
 
@@ -213,10 +251,11 @@ impl Work {
         for &state in self.graph().open() {
             let candidates = self.graph().interior(self.graph().state(state).pose);
             let frame = self.states.read(state).map_err(at(&path))?;
-            let metric = &self.rules.metric;
-            let near = job::nearest(&self.states, metric, &frame, candidates, f32::INFINITY);
+            let frame = (&frame, self.graph().state(state).class);
+            let near = self.similar.nearest(&self.states, frame, candidates, f32::INFINITY);
             let near = near.map_err(at(&path))?;
-            let (target, error_m) = near.expect("the initial pass left every pose a state");
+            let Found { target, error_m, .. } =
+                near.expect("the initial pass left every pose a state");
             merges.push(MergeRecord { state, target, error_m });
         }
         self.record(&Record::Initialised(merges))
@@ -262,16 +301,18 @@ impl Work {
             Local::Known(state) => state,
             Local::New(place) => StateId(first + u64::from(place)),
         };
-        let frame = |f: &job::LocalFrame| FrameRecord {
+        let frame = |f: &LocalFrame| FrameRecord {
             parent: id(f.parent),
             edge: f.edge,
-            merge: f.merge.map(|(target, error_m)| (id(target), error_m)),
+            class: f.class,
+            merge: f.merge.map(|found| (id(found.target), found.error_m)),
         };
         let frames = outcome.frames.iter().map(frame).collect();
         let quality = outcome.quality;
         let remerges = Vec::new();
-        let mut record = JobRecord { round, index, start, frames, remerges, quality };
         let expands = self.graph().initialised().is_some();
+        let future_m = if expands { self.future_m(outcome, start)? } else { None };
+        let mut record = JobRecord { round, index, start, frames, remerges, quality, future_m };
         if expands && !self.rules.paper {
             self.look_at_this_round(outcome, &mut record)?;
             record.remerges = self.nearer_targets(outcome, &record, first)?;
@@ -279,20 +320,41 @@ impl Work {
         Ok(record)
     }
 
+    /// The largest distance (m), along the job's first chain, between what it simulated and what
+    /// was played there while its start was merged.
+    fn future_m(&self, outcome: &Outcome, start: StateId) -> io::Result<Option<f32>> {
+        let Kind::DeadEnd { target: mut played, .. } = self.graph().state(start).kind else {
+            return Ok(None);
+        };
+        let (mut parent, mut worst_m) = (Local::Known(start), None);
+        let frames = outcome.frames.iter().zip(&outcome.states).take(FUTURE_FRAMES);
+        for (place, (frame, state)) in (0..).zip(frames) {
+            let Some(next) = self.graph().follow(played, frame.edge) else { break };
+            if frame.parent != parent {
+                break;
+            }
+            let apart_m = self.similar.metric().distance(state, &self.states.read(next)?);
+            worst_m = Some(apart_m.max(worst_m.unwrap_or(0.0)));
+            (played, parent) = (next, Local::New(place));
+        }
+        Ok(worst_m)
+    }
+
     /// Moves the job's dead ends to nearer states that earlier jobs of its round committed.
     fn look_at_this_round(&self, outcome: &Outcome, record: &mut JobRecord) -> io::Result<()> {
         let graph = self.graph();
         let snapshot = self.ledger.round().snapshot;
-        for (frame, state) in record.frames.iter_mut().zip(&outcome.states) {
-            let Some((_, error_m)) = frame.merge else { continue };
+        let frames = record.frames.iter_mut().zip(&outcome.frames).zip(&outcome.states);
+        for ((frame, local), state) in frames {
+            let Some(Found { cost_m, .. }) = local.merge else { continue };
             let interior = graph.interior(graph.primary().edge(frame.edge).to);
             let since = |id: &StateId| graph.state(*id).interior_since;
             // In order of becoming interior: those after the snapshot come last.
             let new = interior.partition_point(|id| since(id).is_some_and(|s| s <= snapshot));
-            let metric = &self.rules.metric;
-            let near = job::nearest(&self.states, metric, state, &interior[new..], error_m)?;
-            if let Some((target, nearer_m)) = near.filter(|(_, e)| *e < error_m) {
-                frame.merge = Some((target, nearer_m));
+            let state = (state, frame.class);
+            let near = self.similar.nearest(&self.states, state, &interior[new..], cost_m)?;
+            if let Some(found) = near.filter(|found| found.cost_m < cost_m) {
+                frame.merge = Some((found.target, found.error_m));
             }
         }
         Ok(())
@@ -331,23 +393,35 @@ impl Work {
         dead_end: StateId,
         candidates: &[(protocol::PoseId, StateId, &GridState)],
     ) -> io::Result<Option<MergeRecord>> {
-        let Kind::DeadEnd { mut error_m, .. } = self.graph().state(dead_end).kind else {
-            unreachable!("state {dead_end} is listed as a dead end")
-        };
+        let (mut cost_m, mut best) = (self.graph().cost_m(dead_end), None);
+        let similar = &self.similar;
+        let least_m = |target: &StateId| similar.least_cost(dead_end, *target);
+        if candidates.iter().all(|(_, target, _)| least_m(target) >= cost_m) {
+            return Ok(best);
+        }
         let frame = self.states.read(dead_end)?;
-        let mut best = None;
-        for &(_, target, state) in candidates {
-            let near = self.rules.metric.distance_within(&frame, state, error_m);
-            if let Some(nearer_m) = near.filter(|e| *e < error_m) {
-                error_m = nearer_m;
+        let class = self.graph().state(dead_end).class;
+        for &(pose, target, state) in candidates {
+            let other = self.classifier.class(pose, state);
+            let penalty_m = similar.penalties().of(class, other);
+            let near = similar.judge((&frame, state), penalty_m, cost_m);
+            if let Some((error_m, nearer_m)) = near.filter(|(_, nearer_m)| *nearer_m < cost_m) {
+                cost_m = nearer_m;
                 best = Some(MergeRecord { state: dead_end, target, error_m });
             }
         }
         Ok(best)
     }
 
-    fn write_states(&self, first: StateId, states: &[GridState]) -> Result<(), WorkError> {
-        self.states.write(first, states).map_err(at(&self.folder.join("states")))
+    fn write_states(
+        &self,
+        first: StateId,
+        states: &[GridState],
+        classes: &[Class],
+    ) -> Result<(), WorkError> {
+        self.states.write(first, states).map_err(at(&self.folder.join("states")))?;
+        let landmarks = at(&self.folder.join("landmarks"));
+        self.similar.add(first, states, classes).map_err(landmarks)
     }
 
     fn record(&mut self, record: &Record) -> Result<(), WorkError> {
@@ -415,7 +489,7 @@ fn open_cpu(path: &Path) -> io::Result<(File, f64)> {
     Ok((file, if seconds.is_finite() { seconds.max(0.0) } else { 0.0 }))
 }
 
-fn header_digest(header: &Header) -> [u8; 32] {
+pub(super) fn header_digest(header: &Header) -> [u8; 32] {
     let mut hasher = blake3::Hasher::new();
     hasher.update(&header.format.to_le_bytes());
     for (name, value) in &header.inputs {

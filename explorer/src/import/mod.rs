@@ -12,6 +12,7 @@ pub mod components;
 pub mod compute;
 pub mod garment;
 pub mod gltf_file;
+mod metric;
 pub mod motion_graph;
 pub mod obj;
 pub mod reach;
@@ -31,6 +32,7 @@ pub mod transition;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use cloth::Skeleton;
 use protocol::PoseId;
 
 use self::bvh::{Bvh, BvhError};
@@ -43,7 +45,7 @@ use self::scene_file::{MotionSource, SceneFile, SceneFileError, resolve_path};
 use self::transition::Transition;
 use crate::builtin::BuiltinError;
 use crate::primary::PrimaryGraph;
-use crate::scene::{Garment, Scene};
+use crate::scene::{Garment, MetricSettings, Scene};
 
 /// The TOML of the scene `dress`.
 const DRESS: &str = include_str!("../../../scenes/dress.toml");
@@ -262,7 +264,7 @@ fn load_text_with(
     let character = load_character(&file, &place)?;
     let (primary, graph) = load_primary(&file, &character, &place)?;
     let start = start_pose(&file, &primary).map_err(|e| place.error(e))?;
-    let garment = load_garment(&file, &character, &place, options)?;
+    let (garment, metric) = load_garment(&file, &character, &place, options)?;
     let scene = Scene {
         name: file.name.clone(),
         body: Arc::new(character.body),
@@ -270,6 +272,7 @@ fn load_text_with(
         start,
         garment,
         exploration: file.exploration().map_err(|e| place.error(e))?,
+        metric,
     };
     Ok(Loaded { scene, graph: Some(graph) })
 }
@@ -361,7 +364,7 @@ fn load_garment(
     character: &Character,
     place: &Place<'_>,
     options: LoadOptions,
-) -> Result<Garment, SceneError> {
+) -> Result<(Garment, MetricSettings), SceneError> {
     let table = file.garment().map_err(|e| place.error(e))?;
     let path = place.resolve("garment.file", &table.file)?;
     let bytes = read(&path, "garment.file")?;
@@ -378,15 +381,22 @@ fn load_garment(
         let skeleton = &character.body.skeleton;
         let attached = surface.attach(&attachments, skeleton, file_vertices)?;
         check::check_garment(&character.body, &surface.positions, &surface.triangles)?;
-        Ok((surface, attached))
+        Ok((surface, attached, file_vertices))
     };
-    let (surface, attached) =
+    let (surface, attached, file_vertices) =
         make().map_err(|source| SceneError::Garment { path: path.clone(), source })?;
-    Ok(Garment {
+    let metric = metric::resolve(file, &table, (&surface, file_vertices), skeleton_of(character))
+        .map_err(|e| place.error(e))?;
+    let garment = Garment {
         name: table.name.clone().unwrap_or_else(|| file.name.clone()),
         positions: surface.positions,
         triangles: surface.triangles,
         attached,
         fabric: table.fabric().map_err(|e| place.error(e))?,
-    })
+    };
+    Ok((garment, metric))
+}
+
+fn skeleton_of(character: &Character) -> &Skeleton {
+    &character.body.skeleton
 }

@@ -21,10 +21,16 @@
 //! [garment.material]                           # SI; each has a default
 //! density = 0.2
 //!
+//! [garment.regions]                            # default: none; the same forms as attach
+//! hood = [{ near = "Head", within_m = 0.2 }]
+//!
 //! [exploration]                                # each has a default
 //! tolerance_mm = 10.0
 //! ```
+//!
+//! `[exploration.metric]` and `[[exploration.class]]`: see [`super::metric`].
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use protocol::limits::NAME_BYTES_MAX;
@@ -32,6 +38,7 @@ use serde::Deserialize;
 
 use super::compute::Density;
 use super::garment::Attachment;
+use super::metric::{ClassTable, MetricTable};
 use crate::scene::{ExplorationSettings, Fabric};
 
 /// Frames per second that a scene may have.
@@ -134,6 +141,9 @@ pub struct GarmentTable {
     /// What is held to the body.
     #[serde(default)]
     pub attach: Vec<AttachTable>,
+    /// Parts of it that metric and classes name.
+    #[serde(default)]
+    pub regions: BTreeMap<String, Vec<AttachTable>>,
     /// The cloth.
     #[serde(default)]
     pub material: MaterialTable,
@@ -180,6 +190,12 @@ pub struct ExplorationTable {
     drape_frames: Option<u32>,
     rank_max: Option<u16>,
     ground: Option<bool>,
+    /// How states are compared.
+    #[serde(default)]
+    pub metric: MetricTable,
+    /// Classes of states.
+    #[serde(default)]
+    pub class: Vec<ClassTable>,
 }
 
 /// Where a scene's transitions come from.
@@ -324,24 +340,35 @@ impl GarmentTable {
     /// # Errors
     /// None or several kinds in one entry.
     pub fn attachments(&self) -> Result<Vec<Attachment>, SceneFileError> {
-        let one = |(index, a): (usize, &AttachTable)| match (
-            &a.loop_near,
-            &a.near,
-            a.within_m,
-            &a.vertices,
-        ) {
-            (Some(joint), None, None, None) => Ok(Attachment::Loop { joint: joint.clone() }),
-            (None, Some(joint), Some(within_m), None) => {
-                Ok(Attachment::Near { joint: joint.clone(), within_m })
-            }
-            (None, None, None, Some(v)) => Ok(Attachment::Vertices(v.clone())),
-            _ => Err(value(
-                &format!("garment.attach[{index}]"),
-                "give loop_near, or near with within_m, or vertices",
-            )),
-        };
-        self.attach.iter().enumerate().map(one).collect()
+        attachments("garment.attach", &self.attach)
     }
+}
+
+/// Entries of `attach`, or of a region, each of one kind.
+///
+/// # Errors
+/// None or several kinds in one entry; `key` names the list.
+pub(super) fn attachments(
+    key: &str,
+    list: &[AttachTable],
+) -> Result<Vec<Attachment>, SceneFileError> {
+    let one = |(index, a): (usize, &AttachTable)| match (
+        &a.loop_near,
+        &a.near,
+        a.within_m,
+        &a.vertices,
+    ) {
+        (Some(joint), None, None, None) => Ok(Attachment::Loop { joint: joint.clone() }),
+        (None, Some(joint), Some(within_m), None) => {
+            Ok(Attachment::Near { joint: joint.clone(), within_m })
+        }
+        (None, None, None, Some(v)) => Ok(Attachment::Vertices(v.clone())),
+        _ => Err(value(
+            &format!("{key}[{index}]"),
+            "give loop_near, or near with within_m, or vertices",
+        )),
+    };
+    list.iter().enumerate().map(one).collect()
 }
 
 /// A path as written: relative to the scene's folder, or below the data folder.
@@ -371,11 +398,11 @@ fn default_fps() -> f32 {
     30.0
 }
 
-fn value(key: &str, problem: &str) -> SceneFileError {
+pub(super) fn value(key: &str, problem: &str) -> SceneFileError {
     SceneFileError::Value { key: key.to_owned(), problem: problem.to_owned() }
 }
 
-fn named(key: &str, name: &str) -> Result<(), SceneFileError> {
+pub(super) fn named(key: &str, name: &str) -> Result<(), SceneFileError> {
     if (1..=NAME_BYTES_MAX).contains(&name.len()) {
         Ok(())
     } else {
@@ -383,7 +410,11 @@ fn named(key: &str, name: &str) -> Result<(), SceneFileError> {
     }
 }
 
-fn in_range(key: &str, number: f32, [low, high]: [f32; 2]) -> Result<(), SceneFileError> {
+pub(super) fn in_range(
+    key: &str,
+    number: f32,
+    [low, high]: [f32; 2],
+) -> Result<(), SceneFileError> {
     if (low..=high).contains(&number) {
         Ok(())
     } else {

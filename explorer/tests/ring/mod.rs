@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use cloth::{Body, Pose, Quat, Rigid, Skeleton, Vec3};
 use explorer::primary::{PrimaryEdge, PrimaryGraph, PrimaryPose};
-use explorer::scene::{ExplorationSettings, Fabric, Garment, Scene};
+use explorer::scene::{ExplorationSettings, Fabric, Garment, MetricSettings, Scene};
 use explorer::view::{GraphView, Run};
 use protocol::links::LinkEntry;
 use protocol::manifest::VersionStats;
@@ -129,6 +129,7 @@ pub fn scene() -> Scene {
         start: PoseId(0),
         garment,
         exploration: ExplorationSettings::default(),
+        metric: MetricSettings::default(),
     }
 }
 

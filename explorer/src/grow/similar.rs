@@ -1,0 +1,370 @@
+//! Finding the most similar state among many (the paper's FindMostSimilar).
+//!
+//! A few vertices of every state, spread over the garment, are kept in memory. A metric over some
+//! of the vertices is never above the metric over all: candidates are looked at in the order of
+//! this bound, and the search ends at the first whose bound is above what was found. So it returns
+//! exactly what comparing with every candidate returns.
+
+use std::io;
+use std::path::Path;
+use std::sync::{PoisonError, RwLock};
+
+use cloth::Vec3;
+use protocol::StateId;
+
+use super::class::{Class, Penalties};
+use super::metric::Metric;
+use super::states::StateFile;
+use crate::grid::GridState;
+use crate::scene::Scene;
+
+/// Vertices kept of every state: 288 bytes of memory a state.
+pub const LANDMARKS: usize = 24;
+
+type Row = [i16; 6];
+
+/// Everything a search needs.
+#[derive(Debug)]
+pub struct Similar {
+    metric: Metric,
+    few: Metric,
+    penalties: Penalties,
+    vertices: Vec<u32>,
+    vertex_count: usize,
+    file: Option<StateFile>,
+    kept: RwLock<Kept>,
+}
+
+#[derive(Debug, Default)]
+struct Kept {
+    rows: Vec<Row>,
+    classes: Vec<Class>,
+}
+
+/// What was found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Found<T> {
+    /// The most similar state.
+    pub target: T,
+    /// The metric's distance to it (m).
+    pub error_m: f32,
+    /// Distance and the penalty for crossing classes (m): what was made smallest.
+    pub cost_m: f32,
+}
+
+impl<T> Found<T> {
+    /// The same with another name for the target.
+    pub fn of<U>(&self, target: U) -> Found<U> {
+        Found { target, error_m: self.error_m, cost_m: self.cost_m }
+    }
+}
+
+impl Similar {
+    /// Of a scene, without a state yet.
+    pub fn new(scene: &Scene) -> Self {
+        let metric = Metric::of_scene(scene);
+        let vertices = spread(&scene.garment.positions, LANDMARKS);
+        Self {
+            few: metric.of_vertices(&vertices),
+            metric,
+            penalties: Penalties::new(&scene.metric.classes),
+            vertex_count: scene.garment.positions.len(),
+            vertices,
+            file: None,
+            kept: RwLock::default(),
+        }
+    }
+
+    /// Reads the landmarks of the states whose classes these are from the file at `path`, which is
+    /// written anew where it is not whole; from now on additions are kept there.
+    ///
+    /// # Errors
+    /// Neither the file nor the states can be read, or the file cannot be written.
+    pub fn open(
+        &mut self,
+        path: &Path,
+        digest: &[u8; 32],
+        states: &StateFile,
+        classes: Vec<Class>,
+    ) -> io::Result<()> {
+        let (count, size) = (classes.len() as u64, self.vertices.len() as u32);
+        let file = match StateFile::open(path, size, digest, count) {
+            Ok(file) => file,
+            Err(_) => {
+                let file = StateFile::create(path, size, digest)?;
+                for id in (0..count).map(StateId) {
+                    file.write_unsynced(id, &[self.cut(&states.read(id)?)])?;
+                }
+                file.sync()?;
+                file
+            }
+        };
+        let mut rows = Vec::with_capacity(classes.len() * self.vertices.len());
+        for id in (0..count).map(StateId) {
+            let few = file.read(id)?;
+            rows.extend(few.positions.iter().zip(&few.velocities).map(|(p, v)| row(*p, *v)));
+        }
+        self.file = Some(file);
+        self.kept = RwLock::new(Kept { rows, classes });
+        Ok(())
+    }
+
+    /// As [`Similar::open`], but changes nothing on the disk.
+    ///
+    /// # Errors
+    /// The states cannot be read.
+    pub fn keep_all(&mut self, states: &StateFile, classes: Vec<Class>) -> io::Result<()> {
+        let mut rows = Vec::with_capacity(classes.len() * self.vertices.len());
+        for id in (0..classes.len() as u64).map(StateId) {
+            self.push_rows(&mut rows, &states.read(id)?);
+        }
+        self.kept = RwLock::new(Kept { rows, classes });
+        Ok(())
+    }
+
+    /// Adds states, the first of them with the id `first`; on the disk when it returns.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn add(&self, first: StateId, states: &[GridState], classes: &[Class]) -> io::Result<()> {
+        if let Some(file) = &self.file {
+            let few: Vec<GridState> = states.iter().map(|state| self.cut(state)).collect();
+            file.write(first, &few)?;
+        }
+        let mut kept = self.kept.write().unwrap_or_else(PoisonError::into_inner);
+        // What an attempt before left that was never recorded.
+        kept.rows.truncate(first.index() * self.vertices.len());
+        kept.classes.truncate(first.index());
+        states.iter().for_each(|state| self.push_rows(&mut kept.rows, state));
+        kept.classes.extend_from_slice(classes);
+        Ok(())
+    }
+
+    /// The metric.
+    pub fn metric(&self) -> &Metric {
+        &self.metric
+    }
+
+    /// What merges between classes cost.
+    pub fn penalties(&self) -> &Penalties {
+        &self.penalties
+    }
+
+    /// The candidate with the smallest distance plus penalty, if that is at most `bound_m`; of
+    /// equals the lowest id.
+    ///
+    /// # Errors
+    /// A candidate could not be read.
+    pub fn nearest(
+        &self,
+        states: &StateFile,
+        (state, class): (&GridState, Class),
+        candidates: &[StateId],
+        bound_m: f32,
+    ) -> io::Result<Option<Found<StateId>>> {
+        let mut order = self.order((state, class), candidates, bound_m);
+        order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let mut best: Option<Found<StateId>> = None;
+        for (least_m, candidate, penalty_m) in order {
+            let bound_m = best.map_or(bound_m, |found| found.cost_m);
+            if least_m > bound_m {
+                break;
+            }
+            let other = states.read(candidate)?;
+            let found = self.judge((state, &other), penalty_m, bound_m);
+            let found = found.map(|(error_m, cost_m)| Found { target: candidate, error_m, cost_m });
+            if let Some(found) =
+                found.filter(|f| best.is_none_or(|b| (f.cost_m, f.target) < (b.cost_m, b.target)))
+            {
+                best = Some(found);
+            }
+        }
+        Ok(best)
+    }
+
+    /// Error and cost (m) of merging the first state into the second, where the cost is at most
+    /// `bound_m`.
+    pub fn judge(
+        &self,
+        (from, to): (&GridState, &GridState),
+        penalty_m: f32,
+        bound_m: f32,
+    ) -> Option<(f32, f32)> {
+        // A sum rounds: the bound is taken generously here and held below.
+        let room_m = (bound_m - penalty_m) * (1.0 + 1e-6) + 1e-6;
+        let error_m = self.metric.distance_within(from, to, room_m)?;
+        let cost_m = error_m + penalty_m;
+        (cost_m <= bound_m).then_some((error_m, cost_m))
+    }
+
+    /// The least that merging could cost (m), from the landmarks; both states are kept.
+    pub fn least_cost(&self, from: StateId, to: StateId) -> f32 {
+        let kept = self.kept.read().unwrap_or_else(PoisonError::into_inner);
+        let least_m = self.few.least_distance(
+            self.rows(&kept, from),
+            self.rows(&kept, to),
+            self.vertex_count,
+        );
+        least_m + self.penalties.of(kept.classes[from.index()], kept.classes[to.index()])
+    }
+
+    /// Candidates with the least that each could cost, and its penalty (m), without those above
+    /// the bound.
+    fn order(
+        &self,
+        (state, class): (&GridState, Class),
+        candidates: &[StateId],
+        bound_m: f32,
+    ) -> Vec<(f32, StateId, f32)> {
+        let mut own = Vec::with_capacity(self.vertices.len());
+        self.push_rows(&mut own, state);
+        let kept = self.kept.read().unwrap_or_else(PoisonError::into_inner);
+        let mut order = Vec::with_capacity(candidates.len());
+        for &candidate in candidates {
+            let rows = self.rows(&kept, candidate);
+            let penalty_m = self.penalties.of(class, kept.classes[candidate.index()]);
+            let least_m = self.few.least_distance(&own, rows, self.vertex_count) + penalty_m;
+            if least_m <= bound_m {
+                order.push((least_m, candidate, penalty_m));
+            }
+        }
+        order
+    }
+
+    fn rows<'a>(&self, kept: &'a Kept, state: StateId) -> &'a [Row] {
+        let size = self.vertices.len();
+        &kept.rows[state.index() * size..(state.index() + 1) * size]
+    }
+
+    fn push_rows(&self, rows: &mut Vec<Row>, state: &GridState) {
+        let of = |v: &u32| row(state.positions[*v as usize], state.velocities[*v as usize]);
+        rows.extend(self.vertices.iter().map(of));
+    }
+
+    fn cut(&self, state: &GridState) -> GridState {
+        let of = |all: &[[i16; 3]]| self.vertices.iter().map(|v| all[*v as usize]).collect();
+        GridState { positions: of(&state.positions), velocities: of(&state.velocities) }
+    }
+}
+
+fn row([a, b, c]: [i16; 3], [d, e, f]: [i16; 3]) -> Row {
+    [a, b, c, d, e, f]
+}
+
+/// Up to `count` vertices, each as far from those before it as can be: the garment's extremes,
+/// where states differ most, come first.
+fn spread(positions: &[Vec3], count: usize) -> Vec<u32> {
+    let middle = positions.iter().sum::<Vec3>() / positions.len().max(1) as f32;
+    let farthest = |far: &[f32]| {
+        let best = far.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(&a.0)));
+        best.map(|(vertex, _)| vertex)
+    };
+    let mut far: Vec<f32> = positions.iter().map(|p| p.distance_squared(middle)).collect();
+    let mut chosen = Vec::new();
+    while chosen.len() < count.min(positions.len()) {
+        let Some(next) = farthest(&far) else { break };
+        chosen.push(next as u32);
+        for (vertex, far) in far.iter_mut().enumerate() {
+            let from = positions[vertex].distance_squared(positions[next]);
+            *far = if chosen.len() == 1 { from } else { far.min(from) };
+        }
+        far[next] = -1.0;
+    }
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::grow::toy;
+    use crate::scene::{ClassRule, Norm};
+
+    fn scene(vertices: usize, rms: bool, classes: bool) -> Scene {
+        let mut scene = toy::scene(toy::knot(), toy::settings());
+        scene.garment.positions =
+            (0..vertices).map(|v| Vec3::new(v as f32, (v * v % 17) as f32, 0.0)).collect();
+        scene.metric.norm = if rms { Norm::Rms } else { Norm::Largest };
+        scene.metric.weights = (0..vertices).map(|v| 0.5 + (v % 3) as f32).collect();
+        if classes {
+            scene.metric.classes.push(ClassRule {
+                name: "side".into(),
+                values: ["left".into(), "right".into()],
+                joint: 0,
+                vertices: vec![0],
+                axis: Vec3::X,
+                threshold_m: 0.0,
+                implausible: [0, 1],
+                penalty_m: 0.07,
+            });
+        }
+        scene
+    }
+
+    fn states(vertices: usize) -> impl Strategy<Value = Vec<GridState>> {
+        // Few values, so that equal distances occur.
+        let row = proptest::array::uniform3(-2i16..3);
+        let rows = proptest::collection::vec(row, 2 * vertices);
+        let state = rows.prop_map(move |rows| GridState {
+            positions: rows[..vertices].iter().map(|r| r.map(|c| c * 900)).collect(),
+            velocities: rows[vertices..].to_vec(),
+        });
+        proptest::collection::vec(state, 2..25)
+    }
+
+    proptest! {
+        #[test]
+        fn finds_what_comparing_with_all_finds(
+            all in states(40), rms in any::<bool>(), classes in any::<bool>(), share in 0.0f32..3.0,
+        ) {
+            let scene = scene(40, rms, classes);
+            let classifier = crate::grow::class::Classifier::new(&scene);
+            let class = |state: &GridState| classifier.class(protocol::PoseId(0), state);
+            let folder = tempfile::tempdir().unwrap();
+            let file = StateFile::create(&folder.path().join("states"), 40, &[0; 32]).unwrap();
+            file.write(StateId(0), &all).unwrap();
+            let mut similar = Similar::new(&scene);
+            let path = folder.path().join("landmarks");
+            let all_classes: Vec<Class> = all.iter().map(class).collect();
+            similar.open(&path, &[0; 32], &file, all_classes[..1].to_vec()).unwrap();
+            similar.add(StateId(1), &all[1..], &all_classes[1..]).unwrap();
+            let own = &all[0];
+            let candidates: Vec<StateId> = (1..all.len() as u64).map(StateId).collect();
+            let cost = |id: &StateId| {
+                let other = &all[id.index()];
+                similar.metric().distance(own, other)
+                    + similar.penalties().of(class(own), class(other))
+            };
+            let brute = candidates.iter().map(|id| (cost(id), *id)).reduce(|a, b| {
+                if (b.0, b.1) < (a.0, a.1) { b } else { a }
+            }).unwrap();
+            for bound_m in [f32::INFINITY, brute.0 * share] {
+                let found = similar.nearest(&file, (own, class(own)), &candidates, bound_m);
+                let found = found.unwrap().map(|found| (found.cost_m, found.target));
+                prop_assert_eq!(found, (brute.0 <= bound_m).then_some(brute));
+            }
+            for id in &candidates {
+                prop_assert!(similar.least_cost(StateId(0), *id) <= cost(id));
+            }
+            // Opened again, from the file and without it, it knows the same.
+            for _ in 0..2 {
+                let mut again = Similar::new(&scene);
+                again.open(&path, &[0; 32], &file, all_classes.clone()).unwrap();
+                let kept = |similar: &Similar| similar.kept.read().unwrap().rows.clone();
+                prop_assert_eq!(kept(&again), kept(&similar));
+                std::fs::remove_file(&path).unwrap();
+            }
+        }
+    }
+
+    #[test]
+    fn landmarks_are_spread_and_each_is_chosen_once() {
+        let positions: Vec<Vec3> = (0..30).map(|v| Vec3::new(v as f32, 0.0, 0.0)).collect();
+        assert_eq!(spread(&positions, 3), [0, 29, 14]);
+        let mut all = spread(&positions, 100);
+        all.sort_unstable();
+        assert_eq!(all, (0..30).collect::<Vec<u32>>());
+        assert_eq!(spread(&[Vec3::ZERO; 4], 2).len(), 2);
+    }
+}
