@@ -30,6 +30,8 @@ pub enum Command {
     Serve(Serve),
     /// Walk through a served world without a window, and measure it.
     Play(Play),
+    /// Show a served world, or a store, in the browser, and steer it.
+    View(View),
     /// Verify a store and say what is in it.
     Inspect(Inspect),
     /// Simulate a garment along a walk, without a graph, and measure it.
@@ -67,9 +69,12 @@ pub struct Up {
     /// QUIC address.
     #[arg(long, default_value = "127.0.0.1:0")]
     pub listen: SocketAddr,
-    /// HTTP address.
+    /// HTTP address of the server.
     #[arg(long, default_value = "127.0.0.1:0")]
     pub http: SocketAddr,
+    /// Where the page is that shows the character, on this machine only.
+    #[arg(long, default_value = "127.0.0.1:0")]
+    pub page: SocketAddr,
     /// One JSON object on the last line of stdout.
     #[arg(long)]
     pub json: bool,
@@ -170,6 +175,26 @@ pub struct Play {
     /// One JSON object on the last line of stdout.
     #[arg(long)]
     pub json: bool,
+}
+
+/// `toile view`.
+#[derive(Debug, Args)]
+pub struct View {
+    /// A store to show: a folder or a URL. It is served on this machine.
+    #[arg(value_name = "STORE", conflicts_with = "connect")]
+    pub store: Option<String>,
+    /// The QUIC address of a server to show instead.
+    #[arg(long)]
+    pub connect: Option<SocketAddr>,
+    /// SHA-256 of the server's certificate, in hexadecimal.
+    #[arg(long, requires = "connect")]
+    pub fingerprint: Option<String>,
+    /// Token that the server asks for.
+    #[arg(long, env = "TOILE_TOKEN", hide_env_values = true)]
+    pub token: Option<String>,
+    /// Where the page is, on this machine only.
+    #[arg(long, default_value = "127.0.0.1:0")]
+    pub listen: SocketAddr,
 }
 
 /// `toile inspect`.

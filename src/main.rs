@@ -16,6 +16,7 @@ mod serve;
 mod simulate;
 mod store;
 mod up;
+mod view;
 
 use std::process::ExitCode;
 
@@ -30,6 +31,7 @@ fn main() -> ExitCode {
         Command::Explore(a) => explore::run(a),
         Command::Serve(a) => serve::run(a),
         Command::Play(a) => play::run(&a),
+        Command::View(a) => view::run(&a),
         Command::Inspect(a) => inspect::run(&a),
         Command::Simulate(a) => simulate::run(&a),
         Command::Scene(a) => scene::run(a),

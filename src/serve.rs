@@ -46,7 +46,7 @@ pub fn run(a: args::Serve) -> Result<()> {
 }
 
 /// Where a server is to be found, one thing a line.
-pub fn announce(server: &Server) {
+fn announce(server: &Server) {
     println!("quic        {}", server.quic_addr());
     if let Some(http) = server.http_addr() {
         println!("http        http://{http}");

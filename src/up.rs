@@ -16,7 +16,8 @@ use server::{Server, ServerConfig};
 use crate::explore::{Stop, explore_blocking, line};
 use crate::live::Live;
 use crate::store::Opened;
-use crate::{args, format, place, scene, serve, store};
+use crate::view::View;
+use crate::{args, format, place, scene, store};
 
 /// Between two looks at how it goes.
 const POLL: Duration = Duration::from_millis(100);
@@ -60,9 +61,6 @@ pub fn run(a: &args::Up) -> Result<()> {
     };
     let server = runtime.block_on(Server::start(config)).context("starting the server")?;
     eprintln!("scene {} into {store_place}", scene.name);
-    if !a.json {
-        serve::announce(&server);
-    }
     let options = ExploreOptions {
         workers: place::workers(a.workers)?,
         policy: a.policy,
@@ -72,8 +70,14 @@ pub fn run(a: &args::Up) -> Result<()> {
     };
     let explorer = Explorer::start(scene, opened, work, options)?;
     let players = players(&server, a.players)?;
-    let watched = watch(&explorer, &server, &players, &stop, start);
+    let server_page = server.http_addr().map(|http| format!("http://{http}/"));
+    let view = View::start(client(&server), a.page, server_page)?;
+    if !a.json {
+        println!("{}", view.url());
+    }
+    let watched = watch(&explorer, &server, &players, &view, &stop, start);
     stop.stop();
+    drop(view);
     let totals = players.stop();
     let explored = explorer.join();
     let sent = server.stats().bytes_sent;
@@ -115,12 +119,17 @@ impl Explorer {
     }
 }
 
-fn players(server: &Server, count: u32) -> Result<Players> {
-    let client = ClientConfig {
+/// How a player of this process reaches the server.
+fn client(server: &Server) -> ClientConfig {
+    ClientConfig {
         fingerprint: Some(server.fingerprint().to_string()),
         ..ClientConfig::new(server.quic_addr().to_string())
-    };
-    Players::start(count as usize, &PlayersConfig::new(client)).context("starting the players")
+    }
+}
+
+fn players(server: &Server, count: u32) -> Result<Players> {
+    let config = PlayersConfig::new(client(server));
+    Players::start(count as usize, &config).context("starting the players")
 }
 
 struct Watched {
@@ -132,6 +141,7 @@ fn watch(
     explorer: &Explorer,
     server: &Server,
     players: &Players,
+    view: &View,
     stop: &Stop,
     start: Instant,
 ) -> Watched {
@@ -142,6 +152,9 @@ fn watch(
         std::thread::sleep(POLL);
         let stats = server.stats();
         let progress = explorer.progress();
+        if version == 0 {
+            view.tell(progress.as_ref().map_or("starting".into(), line));
+        }
         if stats.version > version {
             version = stats.version;
             watched.first_version.get_or_insert(start.elapsed());

@@ -6,6 +6,30 @@
 /// Frames until an offset is gone.
 pub const BLEND_FRAMES: usize = 10;
 
+/// How an offset disappears.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum BlendMode {
+    /// At once: the jump is seen as it is.
+    Off,
+    /// By a tenth a frame: the causal half of the paper's blend (Kim et al. 2013, section 3).
+    #[default]
+    Linear,
+    /// By a quintic that begins and ends without a jump in velocity or acceleration.
+    Smooth,
+}
+
+impl BlendMode {
+    /// What is left of an offset `age` frames after it began; 1 at first, except where it is off.
+    fn weight(self, age: usize) -> f32 {
+        let t = age as f32 / BLEND_FRAMES as f32;
+        match self {
+            Self::Off => 0.0,
+            Self::Linear => (BLEND_FRAMES - age) as f32 / BLEND_FRAMES as f32,
+            Self::Smooth => 1.0 - t * t * t * (10.0 + t * (6.0 * t - 15.0)),
+        }
+    }
+}
+
 /// Offsets under way, by age. A sum per age is enough, since all decay alike.
 #[derive(Debug, Clone)]
 pub struct Blend {
@@ -15,6 +39,7 @@ pub struct Blend {
     errors_m: [f32; BLEND_FRAMES],
     active: [bool; BLEND_FRAMES],
     newest: usize,
+    mode: BlendMode,
 }
 
 impl Blend {
@@ -26,7 +51,13 @@ impl Blend {
             errors_m: [0.0; BLEND_FRAMES],
             active: [false; BLEND_FRAMES],
             newest: 0,
+            mode: BlendMode::default(),
         }
+    }
+
+    /// Chooses how offsets disappear, those under way included.
+    pub fn set_mode(&mut self, mode: BlendMode) {
+        self.mode = mode;
     }
 
     /// Makes room for appended columns, which are zero in all offsets so far.
@@ -79,7 +110,7 @@ impl Blend {
             if self.active[slot] {
                 let row = &self.rows[slot * self.columns..][..self.columns];
                 for (out, offset) in out.iter_mut().zip(row) {
-                    *out += weight(age) * offset;
+                    *out += self.mode.weight(age) * offset;
                 }
             }
         }
@@ -88,13 +119,8 @@ impl Blend {
     /// What is left of the errors that the offsets hide, in metres.
     pub fn error_m(&self) -> f32 {
         let slot = |age| (self.newest + age) % BLEND_FRAMES;
-        (0..BLEND_FRAMES).map(|age| weight(age) * self.errors_m[slot(age)]).sum()
+        (0..BLEND_FRAMES).map(|age| self.mode.weight(age) * self.errors_m[slot(age)]).sum()
     }
-}
-
-/// Of an offset's ten frames: 1, 0.9, ..., 0.1.
-fn weight(age: usize) -> f32 {
-    (BLEND_FRAMES - age) as f32 / BLEND_FRAMES as f32
 }
 
 #[cfg(test)]
@@ -119,6 +145,23 @@ mod tests {
             assert!((blend.error_m() - 0.01 * tenths(0)).abs() < 1e-7);
             blend.advance();
         }
+    }
+
+    #[test]
+    fn an_offset_can_go_at_once_or_smoothly() {
+        let left = |mode, frames| {
+            let mut blend = Blend::new(1);
+            blend.set_mode(mode);
+            blend.add(&[1.0], &[0.0]);
+            (0..frames).for_each(|_| blend.advance());
+            let mut out = [0.0];
+            blend.apply(&mut out);
+            out[0]
+        };
+        assert_eq!(left(BlendMode::Off, 0), 0.0);
+        assert_eq!((left(BlendMode::Smooth, 0), left(BlendMode::Smooth, 10)), (1.0, 0.0));
+        assert!((left(BlendMode::Smooth, 5) - 0.5).abs() < 1e-6, "even about the middle");
+        assert!(left(BlendMode::Smooth, 1) > 0.99, "no jump in velocity");
     }
 
     #[test]

@@ -18,6 +18,10 @@ use crate::stats::PlayStats;
 use crate::telemetry::Batch;
 use crate::version::{Version, View};
 
+mod look;
+
+pub use look::Passed;
+
 /// A step that takes longer than this counts as missed (design decision 11).
 pub const STEP_LIMIT: Duration = Duration::from_millis(2);
 /// Resident states that are compared when a substitute is looked for.
@@ -77,6 +81,9 @@ pub struct Character {
     placement_before: Placement,
     scratch: Scratch,
     stats: PlayStats,
+    passed: Option<Passed>,
+    /// Whether what is walked is reported.
+    counted: bool,
 }
 
 /// Memory for comparing states, kept between calls.
@@ -114,6 +121,8 @@ impl Character {
             placement_before: placement,
             scratch: Scratch::default(),
             stats: PlayStats::default(),
+            passed: None,
+            counted: true,
             view,
         };
         character.make_room();
@@ -138,6 +147,7 @@ impl Character {
         self.take_newer_view();
         std::mem::swap(&mut self.before, &mut self.now);
         self.placement_before = self.placement;
+        self.passed = None;
         let scene = Arc::clone(self.view.version.scene());
         let edge = scene.edge_between(self.placement.pose(), next_pose);
         let mut outcome = match edge {
@@ -221,6 +231,11 @@ impl Character {
             self.show_substitute(&view, slot, edge)
         };
         self.state = follow.state;
+        self.passed = follow.via.map(|(dead_end, error_m)| Passed {
+            dead_end,
+            target: follow.state,
+            error_m,
+        });
         self.placement.walk(scene, edge);
         outcome
     }
@@ -480,7 +495,9 @@ impl Character {
         if let Some(edge) = edge {
             *self.batch.edges.entry(edge).or_default() += 1;
         }
-        if self.stats.frames.is_multiple_of(FRAMES_PER_BATCH) {
+        if !self.counted {
+            self.batch = Batch::default();
+        } else if self.stats.frames.is_multiple_of(FRAMES_PER_BATCH) {
             self.stage.mailbox().try_post(&mut self.batch);
         }
     }

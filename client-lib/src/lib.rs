@@ -45,7 +45,7 @@
 //! Map: `client` connects (feature `driver`); [`loader`] makes versions of chunks; [`version`] a version assembled, [`cache`] decoded
 //! regions, [`shared`] how both reach the frame loop; [`character`] the face, [`blend`] and
 //! [`placement`] under it; [`prefetch`] what is needed next; [`telemetry`] and [`stats`] what was
-//! played; [`scene`] the checked scene, [`walk`] walks over it.
+//! played; [`scene`] the checked scene, [`walk`] walks over it, [`steer`] the way to a clip.
 
 #![cfg_attr(test, allow(clippy::float_cmp))] // exact values are meant
 
@@ -63,6 +63,7 @@ pub mod prefetch;
 pub mod scene;
 pub mod shared;
 pub mod stats;
+pub mod steer;
 pub mod telemetry;
 pub mod version;
 pub mod walk;
@@ -70,11 +71,15 @@ pub mod walk;
 #[cfg(test)]
 mod tiny;
 
-pub use character::{Character, StepOutcome, decode};
+pub use blend::BlendMode;
+pub use character::{Character, Passed, StepOutcome, decode};
 #[cfg(feature = "driver")]
 pub use client::{Client, ClientConfig, ClientError, Status};
 pub use cloth::Rigid;
 pub use loader::Memory;
+pub use protocol::table::Entry;
+pub use protocol::{GarmentId, PoseId, StateId, VersionNumber};
 pub use scene::Scene;
 pub use stats::{Histogram, PlayStats};
+pub use steer::Steer;
 pub use walk::{Walk, WalkSpec};

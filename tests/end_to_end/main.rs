@@ -6,3 +6,4 @@ mod determinism;
 mod faults;
 mod line;
 mod run;
+mod view;

@@ -235,3 +235,37 @@ fn walked_edges_are_reported_in_batches() {
     assert_eq!(stage.mailbox().drain().edges.values().sum::<u32>(), 15, "the rest at the end");
     assert!(stage.cursors().is_empty());
 }
+
+#[test]
+fn a_character_can_be_placed_before_a_merge_and_says_what_it_passes() {
+    let version = tiny::version(1, tiny::initial_links());
+    let (_stage, mut character) = enter(&tiny::view(&version, &[0]));
+    assert!(character.place(StateId(1)));
+    assert_eq!((character.pose(), character.state()), (at(1), StateId(1)));
+    assert_eq!(character.passed(), None);
+    character.step(at(0));
+    let passed = character.passed().unwrap();
+    assert_eq!((passed.dead_end, passed.target), (StateId(3), StateId(0)));
+    assert!((passed.error_m - 0.01).abs() < 1e-7);
+    assert!(character.place(StateId(3)), "a dead end stands for its target");
+    assert_eq!(character.state(), StateId(0));
+    assert_near(shown(&mut character), tiny::fractions(0));
+    assert!(!character.place(StateId(999)));
+    let mut coefficients = [9.0; 2];
+    assert!(character.read(StateId(3), &mut coefficients));
+    assert_near(coefficients, tiny::fractions(3));
+}
+
+#[test]
+fn without_a_blend_the_jump_is_seen_and_without_counting_nothing_is_reported() {
+    let version = tiny::version(1, tiny::initial_links());
+    let (stage, mut character) = enter(&tiny::view(&version, &[0]));
+    character.set_blend(crate::BlendMode::Off);
+    character.set_counted(false);
+    for frame in 0..60 {
+        character.step(at((frame + 1) % 2));
+    }
+    assert_near(shown(&mut character), tiny::fractions(0));
+    drop(character);
+    assert!(stage.mailbox().drain().is_empty());
+}

@@ -1,0 +1,525 @@
+//! What one page sees: the characters on it, the walk that they take, the frames that it is sent.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, ensure};
+use client_lib::{Character, Histogram, StateId, StepOutcome};
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::actor::{Actor, Blending, Still, Tint};
+use super::app::App;
+use super::dial;
+use super::steering::Steering;
+use super::survey::{Loop, Survey, clip_name};
+use super::wire::{self, FrameWriter};
+
+/// A page that was away for longer does not catch up.
+const LATE_MAX: Duration = Duration::from_millis(500);
+/// Between two reports of figures.
+const REPORT: Duration = Duration::from_millis(250);
+/// Panes side by side.
+pub const PANES_MAX: usize = 4;
+/// Characters in a crowd.
+pub const CROWD_MAX: usize = 100;
+/// Merges passed that wait for the next report.
+const PASSED_MAX: usize = 200;
+/// Room for a character in a crowd (m).
+const CROWD_SPACING_M: f32 = 1.6;
+
+/// What a page asks for.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(tag = "do", rename_all = "lowercase", deny_unknown_fields)]
+pub enum Command {
+    /// Head for a clip; none: wander.
+    Steer {
+        /// Index of the clip.
+        clip: Option<u16>,
+    },
+    /// Slow down; 0 stops.
+    Speed {
+        /// Of the scene's own speed, 0 to 2.
+        times: f32,
+    },
+    /// Leave out columns as far as this error allows.
+    Dial {
+        /// Millimetres.
+        mm: f32,
+    },
+    /// One character in one pane.
+    Play,
+    /// The same walk in up to four panes.
+    Compare {
+        /// What each shows.
+        panes: Vec<Pane>,
+    },
+    /// The walk around a merge.
+    Inspect {
+        /// Its dead end.
+        dead_end: u64,
+    },
+    /// Many characters.
+    Crowd {
+        /// How many.
+        count: usize,
+    },
+}
+
+/// What one pane of a comparison shows.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Pane {
+    /// Skin the cloth to the body instead.
+    plain: bool,
+    /// Columns of the basis; none: as the dial says.
+    columns: Option<usize>,
+    /// How merges are blended.
+    blend: Blending,
+}
+
+/// What is on the page.
+#[derive(Debug)]
+enum Mode {
+    Play,
+    Compare(Vec<Pane>),
+    Inspect { around: Loop, next: usize },
+    Crowd(Vec<Steering>),
+}
+
+/// What one page sees.
+#[derive(Debug)]
+pub struct Show {
+    app: Arc<App>,
+    mode: Mode,
+    actors: Vec<Actor>,
+    steering: Option<Steering>,
+    survey: Option<Survey>,
+    fixed_columns: Vec<Option<usize>>,
+    curve: Vec<dial::Point>,
+    dial_mm: f32,
+    clock: Clock,
+    writer: FrameWriter,
+    figures: Figures,
+    meshes_of: Option<u64>,
+}
+
+/// Scene time, in ticks.
+#[derive(Debug)]
+struct Clock {
+    last: Instant,
+    ticks: f64,
+    played: u64,
+    speed: f64,
+}
+
+/// What is told of the last quarter of a second.
+#[derive(Debug, Default)]
+struct Figures {
+    reported: Option<Instant>,
+    decode_us: Histogram,
+    frame_us: Histogram,
+    steps: [u64; 3],
+    passed: Vec<Passing>,
+    seed: u64,
+}
+
+/// A merge that was walked through.
+#[derive(Debug, Clone, Serialize)]
+struct Passing {
+    frame: u64,
+    dead_end: u64,
+    target: u64,
+    mm: f32,
+    clip: String,
+}
+
+/// What a page is sent.
+#[derive(Debug)]
+pub enum Said {
+    /// Text: an object with `say`.
+    Text(Value),
+    /// Meshes or a frame.
+    Bytes(Vec<u8>),
+}
+
+impl Show {
+    /// A page that has just come.
+    pub fn new(app: Arc<App>, seed: u64) -> Self {
+        let clock = Clock { last: Instant::now(), ticks: 0.0, played: 0, speed: 1.0 };
+        Self {
+            app,
+            mode: Mode::Play,
+            actors: Vec::new(),
+            steering: None,
+            survey: None,
+            fixed_columns: Vec::new(),
+            curve: Vec::new(),
+            dial_mm: 0.0,
+            clock,
+            writer: FrameWriter::default(),
+            figures: Figures { seed, ..Figures::default() },
+            meshes_of: None,
+        }
+    }
+
+    /// Answers a request for a frame: what changed, then the frame itself.
+    ///
+    /// # Errors
+    /// Cloth that cannot be decoded: the page is closed.
+    pub fn frame(&mut self) -> Result<Vec<Said>> {
+        let mut said = Vec::new();
+        if self.actors.is_empty() && !self.enter()? {
+            let status = self.app.client.status();
+            said.push(Said::Text(json!({
+                "say": "waiting", "connected": status.connected, "error": status.error,
+                "exploring": self.app.exploring(),
+            })));
+            return Ok(said);
+        }
+        self.advance()?;
+        self.take_version(&mut said)?;
+        let start = Instant::now();
+        let phase = self.clock.ticks.fract() as f32;
+        self.writer.begin();
+        for actor in &mut self.actors {
+            actor.write(phase, &mut self.figures.decode_us, &mut self.writer)?;
+        }
+        said.push(Said::Bytes(self.writer.end()));
+        self.figures.frame_us.record(start.elapsed().as_secs_f64() * 1e6);
+        if self.figures.reported.is_none_or(|at| at.elapsed() >= REPORT) {
+            said.push(Said::Text(self.report()));
+        }
+        Ok(said)
+    }
+
+    /// Does what a page asks for.
+    ///
+    /// # Errors
+    /// What cannot be done, in words for the page.
+    pub fn command(&mut self, command: Command) -> Result<Option<Value>> {
+        match command {
+            Command::Steer { clip } => {
+                if let Some(steering) = &mut self.steering {
+                    steering.head_for(clip);
+                }
+            }
+            Command::Speed { times } => {
+                ensure!((0.0..=2.0).contains(&times), "a speed from 0 to 2");
+                self.clock.speed = f64::from(times);
+            }
+            Command::Dial { mm } => {
+                ensure!(mm >= 0.0, "millimetres, at least 0");
+                self.dial_mm = mm;
+                self.set_columns();
+            }
+            Command::Play => self.arrange(Mode::Play)?,
+            Command::Compare { panes } => self.arrange(Mode::Compare(panes))?,
+            Command::Crowd { count } => self.crowd(count)?,
+            Command::Inspect { dead_end } => return self.inspect(dead_end).map(Some),
+        }
+        Ok(None)
+    }
+
+    /// Takes the stage as soon as there is a version.
+    fn enter(&mut self) -> Result<bool> {
+        let Ok(character) = self.app.client.character(self.app.garment()) else {
+            return Ok(false);
+        };
+        let scene = Arc::clone(character.version().scene());
+        self.steering = Some(Steering::new(&scene, self.figures.seed));
+        self.actors = vec![Actor::new(character, 0)];
+        self.fixed_columns = vec![None];
+        self.clock.last = Instant::now();
+        Ok(true)
+    }
+
+    /// Plays as many ticks of the scene as the clock says.
+    fn advance(&mut self) -> Result<()> {
+        let Some(lead) = self.actors.first() else { return Ok(()) };
+        let fps = f64::from(lead.character.version().scene().fps());
+        let passed = self.clock.last.elapsed().min(LATE_MAX);
+        self.clock.last = Instant::now();
+        self.clock.ticks += passed.as_secs_f64() * fps * self.clock.speed;
+        while self.clock.played < self.clock.ticks.ceil() as u64 {
+            self.clock.played += 1;
+            self.tick();
+        }
+        Ok(())
+    }
+
+    fn tick(&mut self) {
+        let Some(steering) = &mut self.steering else { return };
+        match &mut self.mode {
+            Mode::Play | Mode::Compare(_) => {
+                let next = steering.next(&self.actors[0].character);
+                for (index, actor) in self.actors.iter_mut().enumerate() {
+                    let outcome = actor.character.step(next);
+                    if index == 0 {
+                        self.figures.count(outcome, &actor.character, self.clock.played);
+                    }
+                }
+            }
+            Mode::Crowd(walks) => {
+                for (actor, walk) in self.actors.iter_mut().zip(walks) {
+                    let next = walk.next(&actor.character);
+                    let outcome = actor.character.step(next);
+                    self.figures.count(outcome, &actor.character, self.clock.played);
+                }
+            }
+            Mode::Inspect { around, next } => {
+                let actor = &mut self.actors[0];
+                if *next >= around.poses.len() {
+                    actor.character.place(around.start);
+                    *next = 0;
+                }
+                let outcome = actor.character.step(around.poses[*next]);
+                self.figures.count(outcome, &actor.character, self.clock.played);
+                let age = next.saturating_sub(around.at) as f32;
+                let is_after = *next >= around.at;
+                actor.tint.weight = if is_after { (1.0 - age / 10.0).max(0.0) } else { 0.0 };
+                *next += 1;
+                fill_stills(&mut self.actors);
+            }
+        }
+    }
+
+    /// Tells the page of a version that was taken up, and looks at it.
+    fn take_version(&mut self, said: &mut Vec<Said>) -> Result<()> {
+        let lead = &self.actors[0].character;
+        let version = Arc::clone(lead.version());
+        if self.survey.as_ref().is_some_and(|survey| survey.is_of(lead)) {
+            return Ok(());
+        }
+        let survey = Survey::new(lead);
+        let scene = version.scene();
+        let steering = self.steering.as_mut().context("there is a walk")?;
+        if !Arc::ptr_eq(steering.scene(), scene) {
+            *steering = Steering::new(scene, self.figures.seed);
+        }
+        if self.meshes_of.is_none() || self.curve.is_empty() {
+            self.meshes_of = Some(version.number().0);
+            let mesh = version.mesh();
+            let bytes = wire::meshes(scene, mesh.vertex_count, &mesh.triangles);
+            said.push(Said::Bytes(bytes));
+        }
+        self.curve = dial::curve(lead)?;
+        said.push(Said::Text(json!({
+            "say": "version", "version": version.number().0, "garment": version.mesh().name,
+            "vertices": version.mesh().vertex_count, "fps": scene.fps(), "clips": scene.clips(),
+            "poses": scene.pose_count(), "edges": scene.edges().len(),
+            "states": version.links().state_count(), "columns": version.basis().columns(),
+            "merges": survey.merges(), "worst": survey.worst(), "curve": self.curve,
+            "server_page": self.app.server_page,
+            "stats": { "worst_mm": version.listing().stats.worst_error_m * 1e3,
+                "mean_mm": version.listing().stats.mean_error_m * 1e3,
+                "codec_max_mm": version.listing().stats.codec_max_error_m * 1e3 },
+        })));
+        self.survey = Some(survey);
+        self.set_columns();
+        if let Mode::Inspect { around, .. } = &self.mode {
+            let dead_end = around.dead_end.0;
+            said.push(Said::Text(self.inspect(dead_end)?));
+        }
+        Ok(())
+    }
+
+    fn set_columns(&mut self) {
+        let by_dial = if self.dial_mm > 0.0 {
+            dial::columns_for(&self.curve, self.dial_mm)
+        } else {
+            usize::MAX
+        };
+        for (actor, fixed) in self.actors.iter_mut().zip(&self.fixed_columns) {
+            actor.columns = fixed.unwrap_or(by_dial);
+        }
+    }
+
+    /// One character, or one per pane, all on the lead's walk.
+    fn arrange(&mut self, mode: Mode) -> Result<()> {
+        ensure!(!self.actors.is_empty(), "nothing is played yet");
+        let panes = match &mode {
+            Mode::Compare(panes) => panes.clone(),
+            _ => vec![Pane::default()],
+        };
+        ensure!(!panes.is_empty() && panes.len() <= PANES_MAX, "1 to {PANES_MAX} panes");
+        let mut actors = Vec::new();
+        for (index, pane) in panes.iter().enumerate() {
+            let character = self.app.client.character(self.app.garment())?;
+            let mut actor = Actor::new(character, index as u32);
+            actor.character.set_counted(index == 0);
+            actor.character.set_blend(pane.blend.into());
+            if pane.plain {
+                actor.be_plain()?;
+            }
+            actor.character.join(&self.actors[0].character);
+            actors.push(actor);
+        }
+        self.actors = actors;
+        self.fixed_columns = panes.iter().map(|pane| pane.columns.map(|n| n.max(1))).collect();
+        self.mode = mode;
+        self.set_columns();
+        Ok(())
+    }
+
+    fn crowd(&mut self, count: usize) -> Result<()> {
+        ensure!((1..=CROWD_MAX).contains(&count), "1 to {CROWD_MAX} characters");
+        let mut actors = Vec::new();
+        let mut walks = Vec::new();
+        let side = (count as f32).sqrt().ceil();
+        for index in 0..count {
+            let character = self.app.client.character(self.app.garment())?;
+            let seed = self.figures.seed.wrapping_add(1 + index as u64);
+            walks.push(Steering::new(character.version().scene(), seed));
+            let mut actor = Actor::new(character, 0);
+            actor.character.set_counted(index == 0);
+            let (row, column) = ((index as f32 / side).floor(), index as f32 % side);
+            let middle = (side - 1.0) / 2.0;
+            let spot = Vec3::new(column - middle, 0.0, row - middle) * CROWD_SPACING_M;
+            actor.spot = Some(spot);
+            actors.push(actor);
+        }
+        self.fixed_columns = vec![None; count];
+        self.actors = actors;
+        self.mode = Mode::Crowd(walks);
+        self.set_columns();
+        Ok(())
+    }
+
+    /// The walk around a merge in the first pane, the dead end and its target beside it.
+    fn inspect(&mut self, dead_end: u64) -> Result<Value> {
+        let survey = self.survey.as_ref().context("nothing is played yet")?;
+        let around = match &self.mode {
+            // Seen again in a newer version: the same walk, so that the two can be compared.
+            Mode::Inspect { around, .. } if around.dead_end.0 == dead_end => around.clone(),
+            _ => survey
+                .around(StateId(dead_end))
+                .with_context(|| format!("no way is known that leads to state {dead_end}"))?,
+        };
+        let now = survey.merge(StateId(dead_end));
+        let worst_mm = survey.worst_on(&around);
+        let garment = self.app.garment();
+        let character = || -> Result<Character> {
+            let mut character = self.app.client.character(garment)?;
+            character.set_counted(false);
+            Ok(character)
+        };
+        let mut walker = Actor::new(character()?, 0);
+        walker.character.place(around.start);
+        let mut actors = vec![walker];
+        let target = now.as_ref().map_or(dead_end, |merge| merge.target);
+        for (pane, state) in [(1, dead_end), (2, target)] {
+            let mut actor = Actor::new(character()?, pane);
+            actor.character.place(StateId(state));
+            actor.still = Some(Still { state: StateId(state), coefficients: Vec::new() });
+            actors.push(actor);
+        }
+        fill_stills(&mut actors);
+        let said = json!({
+            "say": "inspect", "dead_end": dead_end, "merge": now, "worst_mm": worst_mm,
+            "frames": around.poses.len(), "at": around.at,
+            "version": actors[0].character.version().number().0,
+        });
+        self.actors = actors;
+        self.fixed_columns = vec![None; 3];
+        self.mode = Mode::Inspect { around, next: 0 };
+        self.set_columns();
+        Ok(said)
+    }
+
+    /// Figures of the last quarter of a second.
+    fn report(&mut self) -> Value {
+        let status = self.app.client.status();
+        let lead = &self.actors[0].character;
+        let scene = lead.version().scene();
+        let figures = &mut self.figures;
+        figures.reported = Some(Instant::now());
+        let report = json!({
+            "say": "figures",
+            "frame": self.clock.played,
+            "version": lead.version().number().0,
+            "connected": status.connected,
+            "clip": clip_name(scene, lead.pose()),
+            "goal": self.steering.as_ref().and_then(Steering::goal),
+            "answers": self.steering.as_ref().map(Steering::answers),
+            "exact": figures.steps[0], "substituted": figures.steps[1],
+            "missed": figures.steps[2],
+            "shown_mm": lead.shown_error_m() * 1e3,
+            "passed": std::mem::take(&mut figures.passed),
+            "bytes_received": status.bytes_received,
+            "resident_bytes": status.resident_bytes(),
+            "basis_bytes": status.memory.basis,
+            "decode_us": figures.decode_us.percentile(0.5),
+            "frame_us": figures.frame_us.percentile(0.5),
+            "characters": self.actors.len(),
+            "columns": self.actors[0].columns.min(lead.version().basis().columns()),
+        });
+        figures.decode_us = Histogram::default();
+        figures.frame_us = Histogram::default();
+        report
+    }
+}
+
+impl Figures {
+    fn count(&mut self, outcome: StepOutcome, character: &Character, frame: u64) {
+        let kind = match outcome {
+            StepOutcome::Exact => 0,
+            StepOutcome::Substituted { .. } => 1,
+            StepOutcome::Missed => 2,
+        };
+        self.steps[kind] += 1;
+        let Some(passed) = character.passed() else { return };
+        if self.passed.len() < PASSED_MAX {
+            self.passed.push(Passing {
+                frame,
+                dead_end: passed.dead_end.0,
+                target: passed.target.0,
+                mm: passed.error_m * 1e3,
+                clip: clip_name(character.version().scene(), character.pose()),
+            });
+        }
+    }
+}
+
+/// Reads what stills show once it has been streamed, and colours the cloth by their distance.
+fn fill_stills(actors: &mut [Actor]) {
+    let [walker, before, after] = actors else { return };
+    let waits = |actor: &Actor| actor.still.as_ref().is_some_and(|s| s.coefficients.is_empty());
+    if !waits(before) && !waits(after) {
+        return;
+    }
+    for actor in [&mut *before, &mut *after] {
+        actor.character.refresh();
+        let Some(still) = &mut actor.still else { continue };
+        let mut coefficients = vec![0.0; actor.character.version().basis().columns()];
+        if actor.character.read(still.state, &mut coefficients) {
+            still.coefficients = coefficients;
+        }
+    }
+    if waits(before) || waits(after) {
+        return;
+    }
+    let tint = tint(before, after).unwrap_or_default();
+    walker.tint = Tint { weight: 0.0, ..tint.clone() };
+    before.tint = tint.clone();
+    after.tint = tint;
+}
+
+/// Distances between the cloth of two stills, by vertex, as shares of the largest.
+fn tint(a: &Actor, b: &Actor) -> Result<Tint> {
+    let (Some(a_still), Some(b_still)) = (&a.still, &b.still) else { return Ok(Tint::default()) };
+    let basis = a.character.version().basis();
+    let pairs = a_still.coefficients.iter().zip(&b_still.coefficients);
+    let difference: Vec<f32> = pairs.map(|(a, b)| a - b).collect();
+    let mut apart = vec![0.0; basis.rows()];
+    basis.reconstruct(&difference, 0..apart.len(), basis.columns(), &mut apart)?;
+    let (vertices, _) = apart.as_chunks::<3>();
+    let distances = vertices.iter().map(|v| Vec3::from_array(*v).length());
+    let distances: Vec<f32> = distances.collect();
+    let largest = distances.iter().copied().fold(0.0f32, f32::max);
+    if largest < 1e-5 {
+        return Ok(Tint::default());
+    }
+    Ok(Tint { shares: distances.iter().map(|d| d / largest).collect(), weight: 1.0 })
+}
