@@ -1,41 +1,26 @@
-//! The resident basis: columns as they came (8 or 16 bits), in panels of 64 rows, column after
-//! column inside a panel, so that reconstruction reads one sequential stream.
+//! The resident basis: columns as they came (8 or 16 bits), in panels of 64 rows, so that
+//! reconstruction reads one sequential stream.
 
 use std::ops::Range;
 use std::sync::Arc;
 
 use crate::COLUMNS_MAX;
-use crate::kernel::{self, PANEL_ROWS};
+use crate::kernel::{self, Batch, Column, Entries, Panels, PanelsError, Select, Set};
 use crate::kim2013::{Generation, Width};
 
-/// Columns of all generations so far. Appending changes nothing of what is there; a clone shares it.
+/// Columns of all generations so far, and the mean if the profile has one. Appending changes
+/// nothing of what is there; a clone shares it.
 #[derive(Debug, Clone, Default)]
 pub struct Basis {
     rows: usize,
     columns: usize,
     maxima: Vec<f32>,
+    mean: Option<Arc<[f32]>>,
     generations: Vec<Arc<Panels>>,
 }
 
-/// One generation in panel layout.
-#[derive(Debug, Clone)]
-struct Panels {
-    step_m: f32,
-    narrow: Entries<i8>,
-    wide: Entries<i16>,
-}
-
-/// Columns of one width: `numbers.len()` times `PANEL_ROWS` entries a panel.
-#[derive(Debug, Clone)]
-struct Entries<T> {
-    /// Number of each column in the whole basis, ascending.
-    numbers: Vec<u16>,
-    /// Panel after panel; rows past the end are 0.
-    panels: Vec<T>,
-}
-
 /// Why a generation could not be appended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum AppendError {
     /// Rows differ from those of the first generation.
@@ -49,6 +34,9 @@ pub enum AppendError {
     /// Too many columns.
     #[error("{0} columns in all; at most {COLUMNS_MAX} are allowed")]
     Columns(usize),
+    /// Columns that cannot be laid out.
+    #[error(transparent)]
+    Panels(#[from] PanelsError),
 }
 
 /// Why positions could not be reconstructed: a mistake of the caller.
@@ -109,9 +97,17 @@ impl Basis {
         &self.maxima
     }
 
-    /// Memory held by the columns.
+    /// Memory held by the columns and the mean (bytes).
     pub fn resident_bytes(&self) -> usize {
-        self.generations.iter().map(|g| g.narrow.panels.len() + 2 * g.wide.panels.len()).sum()
+        let mean = self.mean.as_ref().map_or(0, |m| size_of_val(&m[..]));
+        mean + self.generations.iter().map(|g| g.resident_bytes()).sum::<usize>()
+    }
+
+    /// Without columns, with the positions (m) that all coefficients at 0 stand for.
+    pub fn with_mean(mean_m: &[f32]) -> Self {
+        // A negative zero would show whether anything was added to it.
+        let mean: Arc<[f32]> = mean_m.iter().map(|m| m + 0.0).collect();
+        Self { rows: mean.len(), mean: Some(mean), ..Self::default() }
     }
 
     /// Appends a generation's columns.
@@ -119,39 +115,61 @@ impl Basis {
     /// # Errors
     /// Other rows than before, or more than `COLUMNS_MAX` columns in all.
     pub fn append(&mut self, generation: &Generation<'_>) -> Result<(), AppendError> {
-        let (expected, actual) = (self.rows, generation.rows());
-        if self.columns > 0 && expected != actual {
-            return Err(AppendError::Rows { expected, actual });
+        let scale_m = generation.step_m();
+        let column = |(width, bytes): (Width, _)| {
+            let entries = match width {
+                Width::Bits8 => Entries::Narrow(bytes),
+                Width::Bits16 => Entries::WideBytes(bytes),
+            };
+            Column { entries, scale_m, limit: 1.0 }
+        };
+        let columns: Vec<Column<'_>> = generation.entries().map(column).collect();
+        let maxima = (0..generation.columns()).map(|c| generation.maximum(c));
+        self.append_columns(generation.rows(), &columns, maxima)
+    }
+
+    /// Appends the columns of a generation of any profile.
+    ///
+    /// * `maxima`: for each column, what [`Basis::maxima`] is to say of it.
+    ///
+    /// # Errors
+    /// Other rows than before, more than `COLUMNS_MAX` columns in all, or columns that differ in
+    /// length or scale nothing.
+    pub fn append_columns(
+        &mut self,
+        rows: usize,
+        columns: &[Column<'_>],
+        maxima: impl Iterator<Item = f32>,
+    ) -> Result<(), AppendError> {
+        if (self.columns > 0 || self.mean.is_some()) && self.rows != rows {
+            return Err(AppendError::Rows { expected: self.rows, actual: rows });
         }
-        let columns = self.columns + generation.columns();
-        if columns > COLUMNS_MAX {
-            return Err(AppendError::Columns(columns));
+        let total = self.columns + columns.len();
+        if total > COLUMNS_MAX {
+            return Err(AppendError::Columns(total));
         }
-        let narrow = Entries::gather(generation, Width::Bits8, self.columns, |b| b[0] as i8);
-        let wide = Entries::gather(generation, Width::Bits16, self.columns, |b| {
-            i16::from_le_bytes([b[0], b[1]])
-        });
-        self.maxima.extend((0..generation.columns()).map(|c| generation.maximum(c)));
-        let step_m = generation.step_m();
-        self.generations.push(Arc::new(Panels { step_m, narrow, wide }));
-        (self.rows, self.columns) = (actual, columns);
+        self.generations.push(Arc::new(Panels::new(rows, columns)?));
+        self.maxima.extend(maxima);
+        self.maxima.resize(total, 1.0);
+        (self.rows, self.columns) = (rows, total);
         Ok(())
     }
 
     /// Positions (m) of `rows` (x0, y0, z0, x1, ...) from the first `columns` coefficients, in
     /// fractions of full scale (`C'` of the paper).
     ///
-    /// Any prefix of columns is a coarser state; any range of rows gives the same numbers as the
-    /// whole. Results are equal bit for bit on every CPU. No allocation. Cost: one pass over the
-    /// entries of these rows and columns.
+    /// `columns` is how many of the first, or a [`Select`] of any. Any range of rows gives the same
+    /// numbers as the whole; a column left out is one whose coefficient is 0. Results are equal bit
+    /// for bit on every CPU: a coefficient is rounded to 16 bits of its column's range, products are
+    /// summed as integers. No allocation. Cost: one pass over the entries of these rows and columns.
     ///
     /// # Errors
     /// Rows, columns or an output that do not fit the basis or each other.
-    pub fn reconstruct(
+    pub fn reconstruct<'a>(
         &self,
         coefficients: &[f32],
         rows: Range<usize>,
-        columns: usize,
+        columns: impl Into<Select<'a>>,
         out: &mut [f32],
     ) -> Result<(), ReconstructError> {
         self.reconstruct_batch(coefficients, coefficients.len(), rows, columns, out)
@@ -159,24 +177,29 @@ impl Basis {
 
     /// As [`Basis::reconstruct`], for several characters that share the basis: `stride`
     /// coefficients each, one after the other; `out` likewise, `rows.len()` numbers each. Every
-    /// panel is read from memory once for all of them.
+    /// panel is read from memory once for each 16 of them.
     ///
     /// # Errors
     /// As for `reconstruct`.
-    pub fn reconstruct_batch(
+    pub fn reconstruct_batch<'a>(
         &self,
         coefficients: &[f32],
         stride: usize,
         rows: Range<usize>,
-        columns: usize,
+        columns: impl Into<Select<'a>>,
         out: &mut [f32],
     ) -> Result<(), ReconstructError> {
         if rows.start > rows.end || rows.end > self.rows {
             let (from, to) = (rows.start, rows.end);
             return Err(ReconstructError::Rows { from, to, rows: self.rows });
         }
-        if columns > self.columns || columns > stride {
-            let (asked, basis) = (columns, self.columns);
+        let select = columns.into();
+        let asked = match select {
+            Select::First(columns) => columns,
+            Select::Only(numbers) => numbers.last().map_or(0, |n| usize::from(*n) + 1),
+        };
+        if asked > self.columns || asked > stride {
+            let basis = self.columns;
             return Err(ReconstructError::Columns { asked, basis, given: stride });
         }
         let characters = coefficients.len().checked_div(stride).unwrap_or(1);
@@ -184,62 +207,8 @@ impl Basis {
         if out.len() != expected {
             return Err(ReconstructError::Output { expected, actual: out.len() });
         }
-        for panel in rows.start / PANEL_ROWS..rows.end.div_ceil(PANEL_ROWS) {
-            let first = panel * PANEL_ROWS;
-            let from = rows.start.max(first);
-            let to = rows.end.min(first + PANEL_ROWS);
-            for character in 0..characters {
-                let coefficients = &coefficients[character * stride..][..columns];
-                let sums = self.panel(panel, coefficients);
-                let at = character * rows.len() + from - rows.start;
-                out[at..at + to - from].copy_from_slice(&sums[from - first..to - first]);
-            }
-        }
+        let batch = Batch { coefficients, stride, rows, select };
+        kernel::decode(Set::detect(), &self.generations, self.mean.as_deref(), &batch, out);
         Ok(())
-    }
-
-    fn panel(&self, panel: usize, coefficients: &[f32]) -> [f32; PANEL_ROWS] {
-        let mut sums = [0.0; PANEL_ROWS];
-        for generation in &self.generations {
-            let wide = generation.wide.prefix(panel, coefficients.len());
-            kernel::add_wide(wide, coefficients, generation.step_m, &mut sums);
-            let narrow = generation.narrow.prefix(panel, coefficients.len());
-            kernel::add_narrow(narrow, coefficients, generation.step_m, &mut sums);
-        }
-        sums
-    }
-}
-
-impl<T: Copy + Default> Entries<T> {
-    /// The columns of `generation` that have this width, rearranged.
-    fn gather(
-        generation: &Generation<'_>,
-        width: Width,
-        first_number: usize,
-        entry: impl Fn(&[u8]) -> T,
-    ) -> Self {
-        let of_width = |(_, (w, _)): &(usize, (Width, &[u8]))| *w == width;
-        let count = generation.entries().enumerate().filter(of_width).count();
-        let mut numbers = Vec::with_capacity(count);
-        let panel_count = generation.rows().div_ceil(PANEL_ROWS);
-        let mut panels = vec![T::default(); panel_count * count * PANEL_ROWS];
-        for (column, (_, bytes)) in generation.entries().enumerate().filter(of_width) {
-            let place = numbers.len() * PANEL_ROWS;
-            numbers.push((first_number + column) as u16);
-            for (panel, bytes) in bytes.chunks(PANEL_ROWS * width.bytes()).enumerate() {
-                let out = &mut panels[panel * count * PANEL_ROWS + place..];
-                for (out, bytes) in out.iter_mut().zip(bytes.chunks_exact(width.bytes())) {
-                    *out = entry(bytes);
-                }
-            }
-        }
-        Self { numbers, panels }
-    }
-
-    /// Entries of one panel for those columns that are among the first `columns` of the basis.
-    fn prefix(&self, panel: usize, columns: usize) -> (&[u16], &[T]) {
-        let count = self.numbers.partition_point(|n| usize::from(*n) < columns);
-        let stride = self.numbers.len() * PANEL_ROWS;
-        (&self.numbers[..count], &self.panels[panel * stride..][..count * PANEL_ROWS])
     }
 }
