@@ -4,7 +4,7 @@ use glam::{Vec3, Vec3A};
 
 use crate::triangle::{self, OnTriangle};
 
-const LEAF_TRIANGLES: usize = 4;
+pub(crate) const LEAF_TRIANGLES: usize = 4;
 /// Deep enough for 2^32 triangles halved at the median.
 const STACK: usize = 64;
 
@@ -20,11 +20,11 @@ pub struct Bvh {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Node {
+pub(crate) struct Node {
     /// Inner node: its right child. Leaf: its first triangle in `order`.
-    link: u32,
+    pub(crate) link: u32,
     /// Triangles of a leaf; 0 for an inner node.
-    count: u32,
+    pub(crate) count: u32,
 }
 
 /// The tree fitted to one pose.
@@ -48,13 +48,7 @@ pub struct Hit {
 impl Bvh {
     /// Splits at the median of the longer side of the centroids' box, until leaves are small.
     pub fn new(positions: &[Vec3], triangles: &[[u32; 3]]) -> Self {
-        let centroids: Vec<Vec3> =
-            triangles.iter().map(|t| t.iter().map(|v| positions[*v as usize]).sum()).collect();
-        let mut order: Vec<u32> = (0..triangles.len() as u32).collect();
-        let mut nodes = Vec::new();
-        if !order.is_empty() {
-            build(&mut order, 0, &centroids, &mut nodes);
-        }
+        let (nodes, order) = split(positions, triangles);
         let corners = order.iter().map(|t| triangles[*t as usize]).collect();
         Self { nodes, order, corners }
     }
@@ -151,6 +145,18 @@ impl Bvh {
         }
         winding
     }
+}
+
+/// Nodes of a tree over triangles, and the triangles in the order of its leaves.
+pub(crate) fn split(positions: &[Vec3], triangles: &[[u32; 3]]) -> (Vec<Node>, Vec<u32>) {
+    let centroids: Vec<Vec3> =
+        triangles.iter().map(|t| t.iter().map(|v| positions[*v as usize]).sum()).collect();
+    let mut order: Vec<u32> = (0..triangles.len() as u32).collect();
+    let mut nodes = Vec::new();
+    if !order.is_empty() {
+        build(&mut order, 0, &centroids, &mut nodes);
+    }
+    (nodes, order)
 }
 
 fn build(order: &mut [u32], first: usize, centroids: &[Vec3], nodes: &mut Vec<Node>) {

@@ -17,6 +17,7 @@
 
 pub mod body;
 pub mod bvh;
+pub mod crossings;
 pub mod fabrics;
 pub mod lab;
 pub mod material;
@@ -24,11 +25,14 @@ pub mod measure;
 pub mod mesh;
 pub mod model;
 pub mod rigid;
+mod segment;
 pub mod solver;
 pub mod surface;
+mod tree;
 pub mod triangle;
 
 pub use body::{Body, Pose, Skeleton};
+pub use crossings::{Crossing, Crossings, crossings};
 pub use glam::{Quat, Vec3};
 pub use material::{Material, MembraneStiffness};
 pub use mesh::{Mesh, MeshError};

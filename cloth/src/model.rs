@@ -10,6 +10,7 @@ use crate::mesh::Mesh;
 use crate::solver::bending;
 use crate::solver::matrix::Pattern;
 use crate::surface::{Posed, Surface};
+use crate::tree::Tree;
 
 /// Gravity, air and ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,6 +25,8 @@ pub struct Environment {
     pub ground: bool,
     /// Coulomb friction against the ground.
     pub ground_friction: f32,
+    /// Whether the cloth keeps off itself.
+    pub self_contact: bool,
 }
 
 impl Default for Environment {
@@ -35,6 +38,7 @@ impl Default for Environment {
             wind: Vec3::ZERO,
             ground: false,
             ground_friction: 0.4,
+            self_contact: true,
         }
     }
 }
@@ -67,6 +71,8 @@ pub struct Model {
     /// Vertex masses (kg).
     pub(crate) masses: Vec<f32>,
     pub(crate) pattern: Pattern,
+    /// Over the garment's triangles.
+    pub(crate) tree: Tree,
     /// Bending energy's Hessian, in the pattern's layout (N/m).
     pub(crate) bending: bending::Stiffness,
 }
@@ -143,6 +149,7 @@ impl Model {
             bending: bending::Stiffness::new(&mesh, &pattern, material.bend),
             held_edges,
             homes,
+            tree: Tree::new(&mesh),
             pattern,
             mesh,
             material,

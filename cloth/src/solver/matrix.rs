@@ -5,6 +5,7 @@ use std::ops::Range;
 use glam::{Mat3A, Vec3A};
 
 use crate::mesh::Mesh;
+use crate::solver::self_contact::Rows as PairRows;
 
 /// Where blocks stand: 3 x 3 blocks between vertices that share an edge, scalars between vertices
 /// that are opposite each other across an edge (bending alone couples those).
@@ -29,6 +30,8 @@ pub(crate) struct Matrix {
     pub(crate) diagonal: Vec<Mat3A>,
     pub(crate) near: Vec<Mat3A>,
     pub(crate) far: Vec<f32>,
+    /// What couples the vertices of pairs in contact; their diagonal blocks are in `diagonal`.
+    pub(crate) pairs: PairRows,
 }
 
 /// Scratch of the solver.
@@ -126,6 +129,7 @@ impl Matrix {
             }
             *out = sum;
         }
+        self.pairs.multiply(x, out);
     }
 
     /// Adds to `x` the solution of `A dx = s.residual` by conjugate gradients with the inverted

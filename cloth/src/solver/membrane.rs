@@ -243,6 +243,7 @@ mod tests {
             diagonal: vec![Mat3A::ZERO; 3],
             near: vec![Mat3A::ZERO; pattern.near.columns.len()],
             far: Vec::new(),
+            ..Matrix::default()
         };
         let c = Constants::new(material);
         assemble(mesh, &pattern, c, 1.0, x, Sums { forces: &mut forces, matrix: &mut matrix });

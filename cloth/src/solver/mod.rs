@@ -10,6 +10,7 @@ pub(crate) mod limit;
 pub(crate) mod matrix;
 pub(crate) mod membrane;
 pub(crate) mod recover;
+pub(crate) mod self_contact;
 
 use glam::{Mat3A, Vec3, Vec3A};
 
@@ -20,6 +21,7 @@ use crate::surface::Posed;
 use contact::{Friction, Kind, Near, Row};
 use matrix::{Given, Matrix, Scratch, Stop};
 use recover::Recovery;
+use self_contact::SelfContact;
 
 /// Longest substep (s).
 pub const SUBSTEP_S_MAX: f32 = 1.0 / 120.0;
@@ -56,6 +58,12 @@ pub struct Effort {
     pub iterations: u32,
     /// Sweeps of the strain limit.
     pub sweeps: u32,
+    /// Pairs of the cloth with itself that were listed.
+    pub pairs: u32,
+    /// Vertices that were moved on in one piece, so that their cloth should not cross itself.
+    pub pieces: u32,
+    /// Pairs that may have crossed nevertheless.
+    pub lost: u32,
 }
 
 /// A step that came out of bounds.
@@ -95,6 +103,7 @@ pub struct Workspace {
     inverse_masses: Vec<f32>,
     free: Vec<f32>,
     recovery: Recovery,
+    self_contact: SelfContact,
     matrix: Matrix,
     scratch: Scratch,
 }
@@ -120,6 +129,9 @@ pub fn step(
     let body_way = way / substeps as f32;
     ws.find_all(model, dt, body_way);
     ws.recovery.mark(model, &ws.near, &ws.held);
+    if model.environment.self_contact {
+        ws.self_contact.find_tangles(model, &ws.x);
+    }
     let mut effort = Effort { substeps, ..Effort::default() };
     for substep in 0..substeps {
         if let Some((from, to)) = span.motion {
@@ -216,10 +228,11 @@ impl Workspace {
         self.linear.fill(Vec3A::ZERO);
         effort.iterations += self.pass(model, dt, true);
         self.find_rows(model, dt, body_way);
+        self.find_pairs(model);
         self.linear.copy_from_slice(&self.dx);
         self.guess.fill(Vec3A::ZERO);
         effort.iterations += self.pass(model, dt, false);
-        effort.sweeps += self.finish(model, dt);
+        self.finish(model, dt, effort);
     }
 
     /// First guess of the way of each vertex: on by its velocity; held vertices go where they
@@ -284,6 +297,18 @@ impl Workspace {
         }
     }
 
+    /// Lists the pairs of the cloth itself that may meet on the way of the first pass.
+    fn find_pairs(&mut self, model: &Model) {
+        if model.environment.self_contact {
+            if self.self_contact.is_tangled() {
+                self.self_contact.find_tangles(model, &self.x);
+            }
+            let apart = self.near.iter().zip(&self.recovery.led).map(|(n, led)| n.pinched || *led);
+            self.self_contact.set_off(model, apart);
+            self.self_contact.find(model, &self.x, &self.dx);
+        }
+    }
+
     /// One Newton pass: linearised at `linear`, started from `guess`, into `dx`.
     fn pass(&mut self, model: &Model, dt: f32, first: bool) -> u32 {
         let stop = if first { FIRST } else { SECOND };
@@ -293,6 +318,17 @@ impl Workspace {
         self.assemble(model, dt);
         self.add_air(model, dt);
         self.add_contacts(model, dt, first);
+        if !first && model.environment.self_contact {
+            let pass = self_contact::Pass {
+                x: &self.x,
+                v: &self.v,
+                way: &self.linear,
+                inverse_masses: &self.inverse_masses,
+                dt,
+            };
+            let force = &mut self.scratch.residual;
+            self.self_contact.add_rows(model, pass, &mut self.matrix, force);
+        }
         let pattern = &model.pattern;
         // The guess enters the residual; its held entries are what held vertices are led by.
         self.matrix.multiply(pattern, &self.guess, &mut self.forces);
@@ -315,6 +351,7 @@ impl Workspace {
         let scale = 1.0 + lag;
         let gravity = Vec3A::from(model.environment.gravity);
         let (matrix, bending) = (&mut self.matrix, &model.bending);
+        matrix.pairs.0.clear();
         for (block, w) in matrix.near.iter_mut().zip(&bending.near) {
             *block = Mat3A::from_diagonal(Vec3::splat(w * scale));
         }
@@ -388,7 +425,7 @@ impl Workspace {
     }
 
     /// Strain limit, new velocities and positions.
-    fn finish(&mut self, model: &Model, dt: f32) -> u32 {
+    fn finish(&mut self, model: &Model, dt: f32, effort: &mut Effort) {
         let ends = &mut self.linear;
         for ((end, x), dx) in ends.iter_mut().zip(&self.x).zip(&self.dx) {
             *end = *x + *dx;
@@ -396,10 +433,24 @@ impl Workspace {
         for (i, end) in ends.iter().enumerate() {
             self.loads[i] = [self.rows[i].load(*end), self.ground[i].load(*end)];
         }
+        let own = model.environment.self_contact;
+        if own {
+            self.self_contact.untangle(model, &self.inverse_masses, ends);
+        }
         let sweeps =
             limit::project(&model.mesh, &self.inverse_masses, &self.free, &self.rows, ends);
+        effort.sweeps += sweeps;
+        let mut moved = sweeps > 0;
+        if own {
+            moved |= self.self_contact.is_tangled();
+            let bounded = self.self_contact.bound(model, &self.x, &self.inverse_masses, ends);
+            moved |= bounded.moved;
+            effort.pairs += self.self_contact.pairs.len() as u32;
+            effort.pieces += bounded.pieces;
+            effort.lost += bounded.lost;
+        }
         for (i, end) in ends.iter().copied().enumerate() {
-            let mut way = if sweeps > 0 { end - self.x[i] } else { self.dx[i] };
+            let mut way = if moved { end - self.x[i] } else { self.dx[i] };
             if !self.held[i] {
                 for (row, load) in [&self.rows[i], &self.ground[i]].into_iter().zip(self.loads[i]) {
                     if load > 0.0 {
@@ -413,7 +464,6 @@ impl Workspace {
                 self.near[i].moved(&c.surface, &self.to, end.into());
             }
         }
-        sweeps
     }
 }
 

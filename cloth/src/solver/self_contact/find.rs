@@ -1,0 +1,100 @@
+//! Lists the pairs that may come near in a substep.
+
+use glam::Vec3A;
+
+use super::SelfContact;
+use super::pair::{Closest, Pair};
+use crate::model::Model;
+use crate::tree::Tree;
+
+/// Share of a pair's distance in the rest shape at which it repels at most: parts of a smooth cloth
+/// are no contact.
+const REST_SHARE: f32 = 0.5;
+
+impl SelfContact {
+    /// Lists the pairs whose distance at `x`, less their parts' relative `way`, is within reach.
+    pub(crate) fn find(&mut self, model: &Model, x: &[Vec3A], way: &[Vec3A]) {
+        let tree = &model.tree;
+        let reach = Self::reach(model);
+        self.listed.clear();
+        self.listed.extend_from_slice(way);
+        let mut pairs = std::mem::take(&mut self.pairs);
+        pairs.clear();
+        let mut fit = std::mem::take(&mut self.fit);
+        tree.fit(|v| x[v as usize], |v| way[v as usize], &mut fit);
+        let search = Search { model, tree, x, way, reach };
+        tree.pairs(&mut fit, reach, true, |fit, i, j| {
+            search.faces(i, j, fit.normals[j as usize][0], &mut pairs);
+            search.faces(j, i, fit.normals[i as usize][0], &mut pairs);
+            search.edges(i, j, &mut pairs);
+        });
+        self.fit = fit;
+        pairs.retain(|p| !self.is_off(p));
+        self.pairs = pairs;
+    }
+}
+
+struct Search<'a> {
+    model: &'a Model,
+    tree: &'a Tree,
+    x: &'a [Vec3A],
+    way: &'a [Vec3A],
+    reach: f32,
+}
+
+impl Search<'_> {
+    /// The vertices that belong to slot `of` against the face of slot `against`.
+    fn faces(&self, of: u32, against: u32, normal: Vec3A, out: &mut Vec<Pair>) {
+        let face = self.tree.corners[against as usize];
+        let owns = self.tree.owns[of as usize];
+        for (k, v) in self.tree.corners[of as usize].into_iter().enumerate() {
+            if owns >> k & 1 == 0 || face.contains(&v) {
+                continue;
+            }
+            let vertices = [v, face[0], face[1], face[2]];
+            let (p, way) = (self.x[v as usize], self.way[v as usize]);
+            let apart = |f: u32| (way - self.way[f as usize]).length_squared();
+            let relative = apart(face[0]).max(apart(face[1])).max(apart(face[2])).sqrt();
+            let most = self.reach + relative;
+            if normal.dot(p - self.x[face[0] as usize]).abs() <= most {
+                self.add(vertices, false, most, out);
+            }
+        }
+    }
+
+    /// The edges that belong to one slot against those that belong to the other.
+    fn edges(&self, i: u32, j: u32, out: &mut Vec<Pair>) {
+        let sides = |slot: u32| {
+            let (corners, owns) = (self.tree.corners[slot as usize], self.tree.owns[slot as usize]);
+            (0..3usize)
+                .filter(move |k| owns >> (3 + k) & 1 == 1)
+                .map(move |k| [corners[k], corners[(k + 1) % 3]])
+        };
+        let way = |v: u32| self.way[v as usize];
+        for a in sides(i) {
+            for b in sides(j) {
+                if a.iter().any(|v| b.contains(v)) {
+                    continue;
+                }
+                let apart = |u: u32, v: u32| (way(u) - way(v)).length_squared();
+                let one = apart(a[0], b[0]).max(apart(a[0], b[1]));
+                let relative = one.max(apart(a[1], b[0])).max(apart(a[1], b[1])).sqrt();
+                let most = self.reach + relative;
+                self.add([a[0], a[1], b[0], b[1]], true, most, out);
+            }
+        }
+    }
+
+    fn add(&self, vertices: [u32; 4], edges: bool, most: f32, out: &mut Vec<Pair>) {
+        let from = self.x[vertices[0] as usize];
+        let c = Closest::of(edges, &vertices.map(|v| self.x[v as usize] - from));
+        let distance = c.across.length();
+        if distance > most || distance <= f32::MIN_POSITIVE {
+            return;
+        }
+        let rest = self.model.mesh.rest_positions();
+        let rest = Closest::of(edges, &vertices.map(|v| Vec3A::from(rest[v as usize])));
+        let keep = self.model.material.offset.min(REST_SHARE * rest.across.length());
+        out.push(Pair { vertices, edges, normal: c.across / distance, distance, keep });
+    }
+}

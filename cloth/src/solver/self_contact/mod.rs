@@ -1,0 +1,91 @@
+//! Contact of the cloth with itself.
+//!
+//! Each substep, where the first pass has led every vertex is known; `find` lists every pair of
+//! a vertex and a face, or of two edges, that may come near on the straight way there. The second
+//! pass solves with a stiff one-sided row for each pair that came too near. `bound` has the
+//! last word on positions.
+//!
+//! # Why nothing passes
+//!
+//! Vertices move straight within a substep, so a cloth that begins without crossing can only cross
+//! where a vertex passes through a face or an edge through an edge. A pair is missing from the list
+//! only if its distance at the beginning less the largest difference of its vertices' predicted
+//! ways exceeds the reach of the list; so it stays apart as long as no vertex ends further from where it was
+//! predicted than half of that, which `bound` checks at the end (and lists again if not). The
+//! listed pairs are checked one by one for the way really gone: each has a direction in which its
+//! parts are apart at both ends, hence always, or conservative advancement shows it. What fails is
+//! pushed apart; what fails still moves on as one piece, without relative motion. Only relative
+//! motion is ever bounded: what moves together goes as far as it likes.
+//!
+//! A pair of which a vertex is held between body parts, is led home, or lies at a place where the
+//! cloth crosses itself already, is left alone: `untangle` works on the last.
+
+mod bound;
+mod find;
+pub(crate) mod pair;
+mod row;
+mod untangle;
+
+use glam::{Vec3, Vec3A};
+
+use crate::crossings::{self, Crossing};
+use crate::model::Model;
+use crate::tree::Fit;
+use pair::Pair;
+pub(crate) use row::{Pass, Rows};
+
+/// Pairs are listed this much beyond the distance at which they act (m).
+const MARGIN_M: f32 = 0.002;
+/// What two parts always keep (m): more than the rounding of a state between frames takes.
+const FLOOR_M: f32 = 2.5e-4;
+
+/// Pairs of a substep and the scratch to find and treat them; nothing outlives a step.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct SelfContact {
+    fit: Fit,
+    pub(crate) pairs: Vec<Pair>,
+    /// Vertices whose pairs are left alone.
+    off: Vec<bool>,
+    /// The ways for which the pairs were listed (m).
+    listed: Vec<Vec3A>,
+    way: Vec<Vec3A>,
+    positions: Vec<Vec3>,
+    crossings: Vec<Crossing>,
+    shifts: Vec<(Vec3A, f32)>,
+    zones: bound::Zones,
+}
+
+impl SelfContact {
+    /// Looks for places where the cloth crosses itself at `x`.
+    pub(crate) fn find_tangles(&mut self, model: &Model, x: &[Vec3A]) {
+        self.positions.clear();
+        self.positions.extend(x.iter().map(|p| Vec3::from(*p)));
+        crossings::find(&model.tree, &mut self.fit, &self.positions, &mut self.crossings);
+    }
+
+    /// Whether the cloth crossed itself when it was looked at last.
+    pub(crate) fn is_tangled(&self) -> bool {
+        !self.crossings.is_empty()
+    }
+
+    /// Marks the vertices whose pairs are left alone in this substep: `apart` and tangled ones.
+    pub(crate) fn set_off(&mut self, model: &Model, apart: impl Iterator<Item = bool>) {
+        self.off.clear();
+        self.off.extend(apart);
+        for c in &self.crossings {
+            let triangle = model.mesh.triangles()[c.triangle as usize];
+            for v in c.edge.iter().chain(&triangle) {
+                self.off[*v as usize] = true;
+            }
+        }
+    }
+
+    fn is_off(&self, pair: &Pair) -> bool {
+        pair.vertices.iter().any(|v| self.off[*v as usize])
+    }
+
+    /// Distance (m) within which pairs are listed.
+    fn reach(model: &Model) -> f32 {
+        model.material.offset + MARGIN_M
+    }
+}

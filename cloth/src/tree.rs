@@ -1,0 +1,280 @@
+//! A binary tree of boxes over a cloth's own triangles: which of them may meet while they move.
+//!
+//! Each box carries the interval of its vertices' displacements besides. Two boxes may meet if
+//! they do after the *relative* displacement of their contents: what moves together, as the cloth
+//! of a fast sleeve does, stays apart however far it goes.
+
+use glam::{Vec3, Vec3A};
+
+use crate::bvh::{self, LEAF_TRIANGLES, Node};
+use crate::mesh::Mesh;
+
+const NONE: u32 = u32::MAX;
+/// Smallest cosine between a smooth patch's normals and their mean.
+const SMOOTH: f32 = 0.4;
+
+/// The tree's shape. Triangles are called by their slot: their place in the order of the leaves.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Tree {
+    nodes: Vec<Node>,
+    /// Triangles by slot.
+    pub(crate) order: Vec<u32>,
+    /// Vertices by slot.
+    pub(crate) corners: Vec<[u32; 3]>,
+    /// Slots across the three sides, or `NONE`.
+    across: Vec<[u32; 3]>,
+    /// Bit k: corner k counts as this slot's; bit 3 + k: the side from corner k to k + 1 does.
+    /// Each vertex and each edge belongs to one slot, so that no pair is met twice.
+    pub(crate) owns: Vec<u8>,
+    /// For each edge of the mesh the vertices of its triangles that it does not have.
+    opposites: Vec<[Option<u32>; 2]>,
+    /// For each node whether it is a leaf whose triangles hang together by their sides.
+    whole: Vec<bool>,
+}
+
+/// The tree fitted to a motion.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Fit {
+    nodes: Vec<Bounds>,
+    slots: Vec<Bounds>,
+    /// Unit normals at the beginning and at the end; zero where a triangle has none.
+    pub(crate) normals: Vec<[Vec3A; 2]>,
+    stack: Vec<[u32; 2]>,
+}
+
+/// Where something begins, and how far it goes.
+#[derive(Debug, Clone, Copy, Default)]
+struct Bounds {
+    low: Vec3A,
+    high: Vec3A,
+    way_low: Vec3A,
+    way_high: Vec3A,
+}
+
+impl Bounds {
+    fn of(points: [Vec3A; 3], ways: [Vec3A; 3]) -> Self {
+        let ([a, b, c], [u, v, w]) = (points, ways);
+        Self {
+            low: a.min(b).min(c),
+            high: a.max(b).max(c),
+            way_low: u.min(v).min(w),
+            way_high: u.max(v).max(w),
+        }
+    }
+
+    fn with(&self, other: &Self) -> Self {
+        Self {
+            low: self.low.min(other.low),
+            high: self.high.max(other.high),
+            way_low: self.way_low.min(other.way_low),
+            way_high: self.way_high.max(other.way_high),
+        }
+    }
+
+    fn meets(&self, other: &Self, reach: Vec3A) -> bool {
+        let down = (self.way_low - other.way_high).min(Vec3A::ZERO) - reach;
+        let up = (self.way_high - other.way_low).max(Vec3A::ZERO) + reach;
+        let apart = (self.low + down).cmpgt(other.high) | (self.high + up).cmplt(other.low);
+        !apart.any()
+    }
+}
+
+impl Tree {
+    /// The tree of a mesh, split by its rest shape.
+    pub(crate) fn new(mesh: &Mesh) -> Self {
+        let (nodes, order) = bvh::split(mesh.rest_positions(), mesh.triangles());
+        let corners: Vec<[u32; 3]> = order.iter().map(|t| mesh.triangles()[*t as usize]).collect();
+        let mut tree = Self {
+            across: across(mesh, &corners),
+            owns: owners(mesh, &corners),
+            opposites: opposites(mesh),
+            whole: Vec::new(),
+            nodes,
+            order,
+            corners,
+        };
+        tree.whole = tree.nodes.iter().map(|n| tree.hangs_together(n)).collect();
+        tree
+    }
+
+    /// The vertices opposite to an edge in its one or two triangles.
+    pub(crate) fn opposites(&self, mesh: &Mesh, edge: [u32; 2]) -> [Option<u32>; 2] {
+        self.opposites[edge_of(mesh, edge[0], edge[1])]
+    }
+
+    fn hangs_together(&self, node: &Node) -> bool {
+        let mut seen = [false; LEAF_TRIANGLES];
+        let mut todo = [node.link; 3 * LEAF_TRIANGLES + 1];
+        let mut left = usize::from(node.count > 0);
+        while left > 0 {
+            left -= 1;
+            let slot = todo[left];
+            if !std::mem::replace(&mut seen[(slot - node.link) as usize], true) {
+                let inside = |s: &&u32| (node.link..node.link + node.count).contains(*s);
+                for next in self.across[slot as usize].iter().filter(inside) {
+                    todo[left] = *next;
+                    left += 1;
+                }
+            }
+        }
+        node.count > 0 && seen.iter().filter(|s| **s).count() == node.count as usize
+    }
+
+    /// Fits the tree to vertices that begin at `at` and go by `way`; no allocation once warm.
+    pub(crate) fn fit(&self, at: impl Fn(u32) -> Vec3A, way: impl Fn(u32) -> Vec3A, fit: &mut Fit) {
+        fit.slots.clear();
+        fit.normals.clear();
+        for corners in &self.corners {
+            let (p, w) = (corners.map(&at), corners.map(&way));
+            fit.slots.push(Bounds::of(p, w));
+            let normal = |[a, b, c]: [Vec3A; 3]| (b - a).cross(c - a).normalize_or_zero();
+            fit.normals.push([normal(p), normal(std::array::from_fn(|k| p[k] + w[k]))]);
+        }
+        fit.nodes.resize(self.nodes.len(), Bounds::default());
+        for i in (0..self.nodes.len()).rev() {
+            let node = self.nodes[i];
+            fit.nodes[i] = if node.count == 0 {
+                fit.nodes[i + 1].with(&fit.nodes[node.link as usize])
+            } else {
+                let leaf = &fit.slots[node.link as usize..][..node.count as usize];
+                leaf[1..].iter().fold(leaf[0], |sum, b| sum.with(b))
+            };
+        }
+    }
+
+    /// Calls `met` for every two slots which may come within `reach` (m) of each other during the
+    /// motion and do not share a side.
+    ///
+    /// With `smooth`, two patches of at most four triangles that share a side are not compared
+    /// while all their normals, before and after, lie within 66 degrees of their mean: such a
+    /// patch projects on its mean plane without folding, so nothing in it meets (Volino &
+    /// Magnenat-Thalmann 1994; the patch is too small for its outline to close on itself).
+    pub(crate) fn pairs(
+        &self,
+        fit: &mut Fit,
+        reach: f32,
+        smooth: bool,
+        mut met: impl FnMut(&Fit, u32, u32),
+    ) {
+        let reach = Vec3A::splat(reach);
+        let mut stack = std::mem::take(&mut fit.stack);
+        stack.clear();
+        stack.push([0, 0]);
+        while let Some([a, b]) = stack.pop() {
+            let (na, nb) = (self.nodes[a as usize], self.nodes[b as usize]);
+            if na.count > 0 && nb.count > 0 {
+                if !(smooth && self.is_smooth(fit, a, b)) {
+                    self.leaves(fit, [na, nb], reach, &mut met);
+                }
+                continue;
+            }
+            if a == b {
+                let (left, right) = (a + 1, na.link);
+                stack.extend([[left, left], [right, right]]);
+                if fit.nodes[left as usize].meets(&fit.nodes[right as usize], reach) {
+                    stack.push([left, right]);
+                }
+                continue;
+            }
+            // Both are opened where they can be.
+            let open = |i: u32, n: Node| if n.count > 0 { [i, NONE] } else { [i + 1, n.link] };
+            for i in open(a, na) {
+                for j in open(b, nb) {
+                    let known = i != NONE && j != NONE;
+                    if known && fit.nodes[i as usize].meets(&fit.nodes[j as usize], reach) {
+                        stack.push([i, j]);
+                    }
+                }
+            }
+        }
+        fit.stack = stack;
+    }
+
+    fn leaves(
+        &self,
+        fit: &Fit,
+        [a, b]: [Node; 2],
+        reach: Vec3A,
+        met: &mut impl FnMut(&Fit, u32, u32),
+    ) {
+        for i in a.link..a.link + a.count {
+            let first = if a.link == b.link { i + 1 } else { b.link };
+            for j in first..b.link + b.count {
+                let near = fit.slots[i as usize].meets(&fit.slots[j as usize], reach);
+                if near && !self.across[i as usize].contains(&j) {
+                    met(fit, i, j);
+                }
+            }
+        }
+    }
+
+    fn is_smooth(&self, fit: &Fit, a: u32, b: u32) -> bool {
+        let (na, nb) = (self.nodes[a as usize], self.nodes[b as usize]);
+        if !self.whole[a as usize] || !self.whole[b as usize] {
+            return false;
+        }
+        let slots = |n: Node| n.link as usize..(n.link + n.count) as usize;
+        let in_b = |s: &u32| slots(nb).contains(&(*s as usize));
+        if a != b && !self.across[slots(na)].iter().flatten().any(|s| in_b(s)) {
+            return false;
+        }
+        let normals = || fit.normals[slots(na)].iter().chain(&fit.normals[slots(nb)]).flatten();
+        let axis = normals().fold(Vec3A::ZERO, |sum, n| sum + *n).normalize_or_zero();
+        normals().all(|n| n.dot(axis) > SMOOTH)
+    }
+}
+
+fn across(mesh: &Mesh, corners: &[[u32; 3]]) -> Vec<[u32; 3]> {
+    let mut first = vec![[NONE; 2]; mesh.edges().len()];
+    let edge = |t: &[u32; 3], k: usize| edge_of(mesh, t[k], t[(k + 1) % 3]);
+    for (slot, t) in corners.iter().enumerate() {
+        for k in 0..3 {
+            let sides = &mut first[edge(t, k)];
+            sides[usize::from(sides[0] != NONE)] = slot as u32;
+        }
+    }
+    let other = |slot: usize, t: &[u32; 3], k: usize| {
+        let [a, b] = first[edge(t, k)];
+        if a == slot as u32 { b } else { a }
+    };
+    let all = |(slot, t): (usize, &[u32; 3])| std::array::from_fn(|k| other(slot, t, k));
+    corners.iter().enumerate().map(all).collect()
+}
+
+fn owners(mesh: &Mesh, corners: &[[u32; 3]]) -> Vec<u8> {
+    let mut vertices = vec![false; mesh.vertex_count()];
+    let mut edges = vec![false; mesh.edges().len()];
+    let own = |t: &[u32; 3]| {
+        let mut bits = 0;
+        for k in 0..3 {
+            let vertex = &mut vertices[t[k] as usize];
+            let edge = &mut edges[edge_of(mesh, t[k], t[(k + 1) % 3])];
+            bits |= u8::from(!std::mem::replace(vertex, true)) << k;
+            bits |= u8::from(!std::mem::replace(edge, true)) << (3 + k);
+        }
+        bits
+    };
+    corners.iter().map(own).collect()
+}
+
+fn opposites(mesh: &Mesh) -> Vec<[Option<u32>; 2]> {
+    let mut all = vec![[None; 2]; mesh.edges().len()];
+    for t in mesh.triangles() {
+        for k in 0..3 {
+            let two = &mut all[edge_of(mesh, t[k], t[(k + 1) % 3])];
+            two[usize::from(two[0].is_some())] = Some(t[(k + 2) % 3]);
+        }
+    }
+    all
+}
+
+/// Index of the edge between two vertices of one triangle.
+fn edge_of(mesh: &Mesh, a: u32, b: u32) -> usize {
+    // Every side of a triangle is an edge of its mesh.
+    mesh.edges().binary_search(&[a.min(b), a.max(b)]).unwrap_or(0)
+}
+
+/// Positions for [`Tree::fit`].
+pub(crate) fn at(positions: &[Vec3]) -> impl Fn(u32) -> Vec3A {
+    |v| Vec3A::from(positions[v as usize])
+}
