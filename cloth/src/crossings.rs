@@ -125,9 +125,11 @@ mod tests {
         let mut t = Vec::new();
         for j in 0..=n {
             for i in 0..=n {
-                let hash =
-                    |k: u32| (i * 73_856 ^ j * 19_349 ^ k * 83_492).wrapping_mul(2_654_435_761);
-                let noise = |k: u32| (hash(k) >> 16) as f32 / 65_536.0;
+                let hash = |k: u32| (i + 31 * (j + 31 * k)).wrapping_mul(2_654_435_761);
+                let noise = |k: u32| {
+                    ((hash(k) ^ (hash(k) >> 15)).wrapping_mul(2_246_822_519) >> 16) as f32
+                        / 65_536.0
+                };
                 p.push(Vec3::new(i as f32, j as f32, 0.0) * 0.01);
                 let at = (j * (n + 1) + i) as usize;
                 p[at] += 0.04 * Vec3::new(noise(1), noise(2), noise(3));

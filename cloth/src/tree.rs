@@ -143,7 +143,7 @@ impl Tree {
     }
 
     /// Calls `met` for every two slots which may come within `reach` (m) of each other during the
-    /// motion and do not share a side.
+    /// motion.
     ///
     /// With `smooth`, two patches of at most four triangles that share a side are not compared
     /// while all their normals, before and after, lie within 66 degrees of their mean: such a
@@ -200,8 +200,7 @@ impl Tree {
         for i in a.link..a.link + a.count {
             let first = if a.link == b.link { i + 1 } else { b.link };
             for j in first..b.link + b.count {
-                let near = fit.slots[i as usize].meets(&fit.slots[j as usize], reach);
-                if near && !self.across[i as usize].contains(&j) {
+                if fit.slots[i as usize].meets(&fit.slots[j as usize], reach) {
                     met(fit, i, j);
                 }
             }
@@ -215,7 +214,7 @@ impl Tree {
         }
         let slots = |n: Node| n.link as usize..(n.link + n.count) as usize;
         let in_b = |s: &u32| slots(nb).contains(&(*s as usize));
-        if a != b && !self.across[slots(na)].iter().flatten().any(|s| in_b(s)) {
+        if a != b && !self.across[slots(na)].iter().flatten().any(in_b) {
             return false;
         }
         let normals = || fit.normals[slots(na)].iter().chain(&fit.normals[slots(nb)]).flatten();

@@ -43,6 +43,13 @@ pub(crate) fn project(
     SWEEPS + LAST_SWEEPS
 }
 
+/// One sweep over the edges that are longer than the last word allows; returns whether there are
+/// none.
+pub(crate) fn settle(mesh: &Mesh, inverse_masses: &[f32], x: &mut [Vec3A]) -> bool {
+    let edges = mesh.edges().iter().copied().zip(mesh.rest_lengths().iter().copied());
+    shorten(edges, LAST_STRAIN, inverse_masses, x)
+}
+
 /// Shortens edges between held vertices where the skin that leads them stretches too far.
 pub(crate) fn tighten(edges: &[([u32; 2], f32)], inverse_masses: &[f32], x: &mut [Vec3A]) {
     for _ in 0..SWEEPS {

@@ -297,6 +297,7 @@ mod tests {
                 diagonal: vec![Mat3A::ZERO; 4],
                 near: vec![Mat3A::ZERO; pattern.near.columns.len()],
                 far: Vec::new(),
+                ..Matrix::default()
             };
             let sums = Sums { forces: &mut forces, matrix: &mut matrix };
             assemble(&mesh, &pattern, Constants::new(&material), 1.0, &x, sums);

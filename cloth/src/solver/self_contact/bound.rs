@@ -5,9 +5,10 @@ use glam::Vec3A;
 use super::pair::{Closest, Pair, mix};
 use super::{FLOOR_M, SelfContact};
 use crate::model::Model;
+use crate::solver::limit;
 
 /// Sweeps in which pairs are pushed apart one by one.
-const SWEEPS: u32 = 12;
+const SWEEPS: u32 = 40;
 /// Rounds after that, in which what would still meet moves on as one piece.
 const ROUNDS: u32 = 24;
 /// Times the pairs are listed again because something moved further than foreseen.
@@ -54,7 +55,7 @@ impl SelfContact {
                 self.find(model, x, &way);
                 self.way = way;
             }
-            if !self.push_apart(x, inverse_masses, ends, &mut done) {
+            if !self.push_apart(model, x, inverse_masses, ends, &mut done) {
                 done.lost = self.move_as_pieces(x, inverse_masses, ends, &mut done);
             }
             if !self.has_strayed(model, x, ends) {
@@ -71,16 +72,18 @@ impl SelfContact {
         ends.iter().zip(foreseen).any(|(e, f)| e.distance_squared(f) > most * most)
     }
 
-    /// Gauss-Seidel over the pairs that would meet; returns whether none is left.
+    /// Gauss-Seidel over the pairs that would meet, in turn with the edges that this stretches too
+    /// far; returns whether none of either is left.
     fn push_apart(
         &self,
+        model: &Model,
         x: &[Vec3A],
         inverse_masses: &[f32],
         ends: &mut [Vec3A],
         done: &mut Bounded,
     ) -> bool {
         for _ in 0..SWEEPS {
-            let mut clear = true;
+            let mut clear = !done.moved || limit::settle(&model.mesh, inverse_masses, ends);
             for pair in &self.pairs {
                 let from = x[pair.vertices[0] as usize];
                 let (a, b) = (pair.gather(from, x), pair.gather(from, ends));
