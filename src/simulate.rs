@@ -166,6 +166,7 @@ fn print(garment: &str, vertices: usize, s: &Sum) {
          ({:.2e} more pinched); deepest {:.1} mm",
         s.deep_1mm_share, s.deep_5mm_share, s.pinched_share, s.depth_max_mm
     );
+    println!("{} crossings of the cloth with itself, in {} frames", s.self_hits, s.self_hit_frames);
     println!(
         "fastest vertex {:.1} m/s; {} frames retried, {} flagged",
         s.speed_max_m_s, s.frames_retried, s.frames_flagged

@@ -17,6 +17,7 @@ const SMOOTH: f32 = 0.4;
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Tree {
     nodes: Vec<Node>,
+    vertices: usize,
     /// Triangles by slot.
     pub(crate) order: Vec<u32>,
     /// Vertices by slot.
@@ -39,6 +40,8 @@ pub(crate) struct Fit {
     slots: Vec<Bounds>,
     /// Unit normals at the beginning and at the end; zero where a triangle has none.
     pub(crate) normals: Vec<[Vec3A; 2]>,
+    /// For each vertex the sum of the normals around it, and whether they all lie near that.
+    around: Vec<(Vec3A, bool)>,
     stack: Vec<[u32; 2]>,
 }
 
@@ -89,6 +92,7 @@ impl Tree {
             owns: owners(mesh, &corners),
             opposites: opposites(mesh),
             whole: Vec::new(),
+            vertices: mesh.vertex_count(),
             nodes,
             order,
             corners,
@@ -130,6 +134,7 @@ impl Tree {
             let normal = |[a, b, c]: [Vec3A; 3]| (b - a).cross(c - a).normalize_or_zero();
             fit.normals.push([normal(p), normal(std::array::from_fn(|k| p[k] + w[k]))]);
         }
+        self.fit_fans(fit);
         fit.nodes.resize(self.nodes.len(), Bounds::default());
         for i in (0..self.nodes.len()).rev() {
             let node = self.nodes[i];
@@ -142,13 +147,35 @@ impl Tree {
         }
     }
 
+    /// Finds the vertices around which the cloth is smooth before and after.
+    fn fit_fans(&self, fit: &mut Fit) {
+        fit.around.clear();
+        fit.around.resize(self.vertices, (Vec3A::ZERO, true));
+        for (corners, normals) in self.corners.iter().zip(&fit.normals) {
+            for v in corners {
+                fit.around[*v as usize].0 += normals[0] + normals[1];
+            }
+        }
+        for (sum, _) in &mut fit.around {
+            *sum = sum.normalize_or_zero();
+        }
+        for (corners, normals) in self.corners.iter().zip(&fit.normals) {
+            for v in corners {
+                let (axis, smooth) = &mut fit.around[*v as usize];
+                *smooth &= normals[0].dot(*axis).min(normals[1].dot(*axis)) > SMOOTH;
+            }
+        }
+    }
+
     /// Calls `met` for every two slots which may come within `reach` (m) of each other during the
     /// motion.
     ///
-    /// With `smooth`, two patches of at most four triangles that share a side are not compared
-    /// while all their normals, before and after, lie within 66 degrees of their mean: such a
-    /// patch projects on its mean plane without folding, so nothing in it meets (Volino &
-    /// Magnenat-Thalmann 1994; the patch is too small for its outline to close on itself).
+    /// With `smooth`, triangles of a smooth patch are not compared: two leaves that share a side,
+    /// or the triangles around a vertex, while all their normals, before and after, lie within 66
+    /// degrees of their mean. Such a patch projects on its mean plane without folding, so nothing
+    /// in it meets (Volino & Magnenat-Thalmann 1994; it is too small for its outline to close on
+    /// itself). Two triangles at a common side are not compared while they are folded by less than
+    /// a right angle.
     pub(crate) fn pairs(
         &self,
         fit: &mut Fit,
@@ -164,7 +191,7 @@ impl Tree {
             let (na, nb) = (self.nodes[a as usize], self.nodes[b as usize]);
             if na.count > 0 && nb.count > 0 {
                 if !(smooth && self.is_smooth(fit, a, b)) {
-                    self.leaves(fit, [na, nb], reach, &mut met);
+                    self.leaves(fit, [na, nb], (reach, smooth), &mut met);
                 }
                 continue;
             }
@@ -194,17 +221,30 @@ impl Tree {
         &self,
         fit: &Fit,
         [a, b]: [Node; 2],
-        reach: Vec3A,
+        (reach, smooth): (Vec3A, bool),
         met: &mut impl FnMut(&Fit, u32, u32),
     ) {
         for i in a.link..a.link + a.count {
             let first = if a.link == b.link { i + 1 } else { b.link };
             for j in first..b.link + b.count {
-                if fit.slots[i as usize].meets(&fit.slots[j as usize], reach) {
+                let near = fit.slots[i as usize].meets(&fit.slots[j as usize], reach);
+                if near && !(smooth && self.is_fan(fit, i as usize, j as usize)) {
                     met(fit, i, j);
                 }
             }
         }
+    }
+
+    /// Whether two triangles belong to one smooth fan, or are hardly folded at their common side.
+    fn is_fan(&self, fit: &Fit, i: usize, j: usize) -> bool {
+        if self.across[i].contains(&(j as u32)) {
+            let (a, b) = (fit.normals[i], fit.normals[j]);
+            if a[0].dot(b[0]).min(a[1].dot(b[1])) > 0.0 {
+                return true;
+            }
+        }
+        let shared = |v: &&u32| self.corners[j].contains(*v);
+        self.corners[i].iter().filter(shared).any(|v| fit.around[*v as usize].1)
     }
 
     fn is_smooth(&self, fit: &Fit, a: u32, b: u32) -> bool {

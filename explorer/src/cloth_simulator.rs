@@ -6,7 +6,9 @@
 
 use std::sync::Arc;
 
-use cloth::{Environment, Mesh, Model, Pose, Rigid, Span, State, Vec3, Workspace, measure};
+use cloth::{
+    Crossings, Environment, Mesh, Model, Pose, Rigid, Span, State, Vec3, Workspace, measure,
+};
 use protocol::EdgeId;
 
 use crate::grid::GridState;
@@ -23,6 +25,7 @@ pub struct ClothSimulator {
     scene: Arc<Scene>,
     model: Arc<Model>,
     workspace: Workspace,
+    crossings: Crossings,
     refine: u32,
     nudge: Vec3,
 }
@@ -44,8 +47,11 @@ impl ClothSimulatorFactory {
         let refused = |what: String| SimulateError(format!("garment {}: {what}", garment.name));
         let mesh = Mesh::new(garment.positions.clone(), garment.triangles.clone())
             .map_err(|e| refused(e.to_string()))?;
-        let environment =
-            Environment { ground: scene.exploration.ground, ..Environment::default() };
+        let environment = Environment {
+            ground: scene.exploration.ground,
+            self_contact: scene.exploration.self_contact,
+            ..Environment::default()
+        };
         let body = Some(scene.body.clone());
         let model = Model::new(mesh, garment.fabric, environment, body, &garment.attached)
             .map_err(|e| refused(e.to_string()))?;
@@ -58,6 +64,7 @@ impl ClothSimulatorFactory {
             scene: self.scene.clone(),
             model: self.model.clone(),
             workspace: Workspace::default(),
+            crossings: Crossings::new(self.model.mesh()),
             refine: 1,
             nudge: Vec3::ZERO,
         }
@@ -158,10 +165,13 @@ impl ClothSimulator {
     }
 
     /// Measures a state as it will be kept: rounded.
-    fn measured(&self, state: GridState, pose: &Pose) -> Frame {
+    fn measured(&mut self, state: GridState, pose: &Pose) -> Frame {
         let world = to_world(&state, &pose.hips());
+        let crossings = self.crossings.find(&world.positions).len() as u64;
         let mut quality = FrameQuality {
             frames: 1,
+            crossings,
+            crossed_frames: u64::from(crossings > 0),
             vertex_frames: state.vertex_count() as u64,
             stretch_max: measure::stretch_max(self.model.mesh(), &world.positions),
             speed_max_m_s: world.velocities.iter().map(|v| v.length()).fold(0.0, f32::max),

@@ -108,6 +108,8 @@ pub struct ExplorationSettings {
     pub rank_max: u16,
     /// Ground plane at y = 0.
     pub ground: bool,
+    /// Whether the cloth keeps off itself.
+    pub self_contact: bool,
 }
 
 impl Default for ExplorationSettings {
@@ -121,6 +123,7 @@ impl Default for ExplorationSettings {
             drape_frames: 45,
             rank_max: 200,
             ground: true,
+            self_contact: true,
         }
     }
 }

@@ -52,6 +52,10 @@ pub struct FrameQuality {
     pub pinched_vertex_frames: u64,
     /// Deepest vertex that is not held between two body parts (m).
     pub depth_max_m: f32,
+    /// Pairs of an edge and a triangle of the cloth that cut each other.
+    pub crossings: u64,
+    /// Frames in which there is such a pair.
+    pub crossed_frames: u64,
     /// Largest strain of an edge (0.1: 10 % longer than at rest).
     pub stretch_max: f32,
     /// Fastest vertex (m/s).
@@ -75,6 +79,8 @@ impl FrameQuality {
         self.deep_vertex_frames += other.deep_vertex_frames;
         self.pinched_vertex_frames += other.pinched_vertex_frames;
         self.depth_max_m = self.depth_max_m.max(other.depth_max_m);
+        self.crossings += other.crossings;
+        self.crossed_frames += other.crossed_frames;
         self.stretch_max = self.stretch_max.max(other.stretch_max);
         self.speed_max_m_s = self.speed_max_m_s.max(other.speed_max_m_s);
         self.substeps += other.substeps;

@@ -303,7 +303,8 @@ impl Workspace {
             if self.self_contact.is_tangled() {
                 self.self_contact.find_tangles(model, &self.x);
             }
-            let apart = self.near.iter().zip(&self.recovery.led).map(|(n, led)| n.pinched || *led);
+            let apart =
+                self.near.iter().zip(&self.recovery.led).map(|(n, led)| *led || n.is_buried());
             self.self_contact.set_off(model, apart);
             self.self_contact.find(model, &self.x, &self.dx);
         }

@@ -190,6 +190,7 @@ pub struct ExplorationTable {
     drape_frames: Option<u32>,
     rank_max: Option<u16>,
     ground: Option<bool>,
+    self_contact: Option<bool>,
     /// How states are compared.
     #[serde(default)]
     pub metric: MetricTable,
@@ -303,6 +304,7 @@ impl SceneFile {
             drape_frames: t.drape_frames.unwrap_or(default.drape_frames),
             rank_max: t.rank_max.unwrap_or(default.rank_max),
             ground: t.ground.unwrap_or(default.ground),
+            self_contact: t.self_contact.unwrap_or(default.self_contact),
         })
     }
 }

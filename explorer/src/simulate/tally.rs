@@ -42,6 +42,10 @@ pub struct Sum {
     pub pinched_share: f64,
     /// Deepest vertex that is not held between body parts (mm).
     pub depth_max_mm: f32,
+    /// Pairs of an edge and a triangle of the cloth that cut each other, in all frames,
+    pub self_hits: u64,
+    /// and the frames in which there are any.
+    pub self_hit_frames: u64,
     /// 99 of 100 edges of all frames are strained less (%).
     pub stretch_p99_pct: f32,
     /// Largest strain of an edge (%).
@@ -99,6 +103,8 @@ impl Tally {
             deep_5mm_share: share(q.deep_vertex_frames),
             pinched_share: share(q.pinched_vertex_frames),
             depth_max_mm: q.depth_max_m * 1e3,
+            self_hits: q.crossings,
+            self_hit_frames: q.crossed_frames,
             stretch_p99_pct: self.strain_quantile(0.99) * 100.0,
             stretch_max_pct: q.stretch_max * 100.0,
             speed_max_m_s: q.speed_max_m_s,

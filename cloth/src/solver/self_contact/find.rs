@@ -71,6 +71,7 @@ impl Search<'_> {
                 .map(move |k| [corners[k], corners[(k + 1) % 3]])
         };
         let way = |v: u32| self.way[v as usize];
+        let at = |v: u32| self.x[v as usize];
         for a in sides(i) {
             for b in sides(j) {
                 if a.iter().any(|v| b.contains(v)) {
@@ -80,6 +81,12 @@ impl Search<'_> {
                 let one = apart(a[0], b[0]).max(apart(a[0], b[1]));
                 let relative = one.max(apart(a[1], b[0])).max(apart(a[1], b[1])).sqrt();
                 let most = self.reach + relative;
+                let (p, q) = (a.map(at), b.map(at));
+                let below = p[0].min(p[1]) - q[0].max(q[1]);
+                let above = q[0].min(q[1]) - p[0].max(p[1]);
+                if below.max(above).max_element() > most {
+                    continue;
+                }
                 self.add([a[0], a[1], b[0], b[1]], true, most, out);
             }
         }
