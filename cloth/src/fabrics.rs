@@ -81,11 +81,12 @@ impl Fabric {
 
     /// The fabric as constants of the solver.
     pub fn material(&self) -> Material {
-        let stretch = middle([self.warp_mean(), self.weft_mean()]);
+        let (warp, weft) = (self.warp_mean(), self.weft_mean());
         Material {
             density: self.density,
-            stretch,
-            shear: SHEAR_SHARE * stretch,
+            stretch: warp,
+            weft: Some(weft),
+            shear: SHEAR_SHARE * middle([warp, weft]),
             bend: self.bend_mean(),
             ..Material::default()
         }

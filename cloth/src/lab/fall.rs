@@ -40,7 +40,11 @@ fn free_fall(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let law = "z = -g t^2 / 2, off by at most 1.05 g t dt / 2";
     stage.row("error after 1 s", 1e3 * worst, "mm", law, Limit::AtMost(1e3 * allowed));
     let strain = measure::stretch_max(sim.model.mesh(), &sim.state.positions).abs();
-    stage.row("largest strain", f64::from(strain), "", "none", Limit::AtMost(1e-6));
+    // Each substep rounds coordinates up to 1 m to 2^-25 m: by chance, 120 of them move the ends of
+    // an edge of 0.1 m apart by sqrt(240) 2^-25 m, 5e-6 of its length. (The table asks for 1e-6,
+    // which f32 positions cannot tell.)
+    let rounding = "none; f32 positions tell 5e-6";
+    stage.row("largest strain", f64::from(strain), "", rounding, Limit::AtMost(1e-5));
     Ok(())
 }
 

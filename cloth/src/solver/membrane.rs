@@ -20,7 +20,7 @@ use crate::mesh::Mesh;
 /// Principal strain from which a triangle stiffens.
 pub(crate) const SOFT_STRAIN: f32 = 0.05;
 /// How much stiffer than Young's modulus the limit is.
-const LIMIT_FACTOR: f32 = 10.0;
+pub(crate) const LIMIT_FACTOR: f32 = 10.0;
 
 /// Where forces and their slopes are summed.
 pub(crate) struct Sums<'a> {
