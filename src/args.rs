@@ -40,6 +40,8 @@ pub enum Command {
     Scene(Scene),
     /// The simulator's test bench: scenes with known answers.
     Lab(Lab),
+    /// Measure the codec.
+    Codec(Codec),
 }
 
 /// `toile up`.
@@ -281,6 +283,32 @@ pub enum SceneCommand {
         #[arg(long, value_name = "FILE.png")]
         out: PathBuf,
     },
+}
+
+/// `toile codec`.
+#[derive(Debug, Args)]
+pub struct Codec {
+    /// What to measure.
+    #[command(subcommand)]
+    pub command: CodecCommand,
+}
+
+/// The commands of `toile codec`.
+#[derive(Debug, Subcommand)]
+pub enum CodecCommand {
+    /// Time decoding at the papers' dimensions beside the speed of this machine's memory.
+    DecodeBench(DecodeBench),
+}
+
+/// `toile codec decode-bench`.
+#[derive(Debug, Args)]
+pub struct DecodeBench {
+    /// Other memory read between cold frames, and for the read bandwidth (MiB).
+    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u32).range(256..=65536))]
+    pub other_mb: u32,
+    /// One JSON object on the last line of stdout.
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `toile lab`.

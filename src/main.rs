@@ -2,6 +2,7 @@
 
 mod args;
 mod clock;
+mod decode_bench;
 mod explore;
 mod format;
 mod inspect;
@@ -36,6 +37,9 @@ fn main() -> ExitCode {
         Command::Simulate(a) => simulate::run(&a),
         Command::Scene(a) => scene::run(a),
         Command::Lab(a) => lab::run(a),
+        Command::Codec(a) => match a.command {
+            args::CodecCommand::DecodeBench(a) => decode_bench::run(&a),
+        },
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

@@ -10,6 +10,7 @@ pub mod builtin;
 pub mod certificate;
 pub mod cloth_simulator;
 pub mod cpu;
+pub mod decode_bench;
 pub mod disk;
 pub mod explore;
 pub mod grid;

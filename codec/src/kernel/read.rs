@@ -1,6 +1,7 @@
 //! How fast memory can be read at all: what a decoder that is bound by memory is compared with.
 
 use super::Set;
+use super::memory::with_huge_pages;
 
 /// Ways to read memory; which is fastest depends on the machine and on what its neighbours do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -9,15 +10,28 @@ pub enum Reader {
     Plain,
     /// One stream, asking 4 KiB ahead.
     Ahead,
+    /// One stream, asking 1 KiB ahead.
+    Near,
     /// Four streams at once.
     Four,
+    /// Four streams at once, asking 4 KiB ahead in each.
+    FourAhead,
     /// Sixteen streams at once.
     Sixteen,
 }
 
 impl Reader {
     /// All of them.
-    pub const ALL: [Self; 4] = [Self::Plain, Self::Ahead, Self::Four, Self::Sixteen];
+    pub const ALL: [Self; 6] =
+        [Self::Plain, Self::Ahead, Self::Near, Self::Four, Self::FourAhead, Self::Sixteen];
+}
+
+/// So many MiB to read, on huge pages where the system gives them, as a basis is.
+pub fn memory(mib: usize) -> Vec<u64> {
+    let count = mib << 17;
+    let mut words = with_huge_pages(count);
+    words.extend(0..count as u64);
+    words
 }
 
 /// Adds up all `words` (wrapping) with the best vectors of this CPU; reads each exactly once.
@@ -49,10 +63,12 @@ fn read_avx2(reader: Reader, words: &[u64]) -> u64 {
 #[inline(always)]
 fn any(reader: Reader, words: &[u64]) -> u64 {
     match reader {
-        Reader::Plain => streams::<1, false>(words),
-        Reader::Ahead => streams::<1, true>(words),
-        Reader::Four => streams::<4, false>(words),
-        Reader::Sixteen => streams::<16, false>(words),
+        Reader::Plain => streams::<1, 0>(words),
+        Reader::Ahead => streams::<1, 4096>(words),
+        Reader::Near => streams::<1, 1024>(words),
+        Reader::Four => streams::<4, 0>(words),
+        Reader::FourAhead => streams::<4, 4096>(words),
+        Reader::Sixteen => streams::<16, 0>(words),
     }
 }
 
@@ -60,7 +76,7 @@ fn any(reader: Reader, words: &[u64]) -> u64 {
 const STRIDE: usize = 32;
 
 #[inline(always)]
-fn streams<const N: usize, const AHEAD: bool>(words: &[u64]) -> u64 {
+fn streams<const N: usize, const AHEAD: usize>(words: &[u64]) -> u64 {
     let blocks = words.len() / (N * STRIDE);
     let (even, rest) = words.split_at(blocks * N * STRIDE);
     let mut sums = [0u64; STRIDE];
@@ -69,8 +85,8 @@ fn streams<const N: usize, const AHEAD: bool>(words: &[u64]) -> u64 {
     for block in 0..blocks {
         for part in parts {
             let from = &part[block * STRIDE..][..STRIDE];
-            if AHEAD {
-                ask_ahead(from);
+            if AHEAD > 0 {
+                ask_ahead::<AHEAD>(from);
             }
             for (sum, word) in sums.iter_mut().zip(from) {
                 *sum = sum.wrapping_add(*word);
@@ -82,11 +98,11 @@ fn streams<const N: usize, const AHEAD: bool>(words: &[u64]) -> u64 {
 
 #[inline(always)]
 #[allow(unsafe_code)] // prefetch
-fn ask_ahead(from: &[u64]) {
+fn ask_ahead<const AHEAD: usize>(from: &[u64]) {
     #[cfg(target_arch = "x86_64")]
     for line in 0..STRIDE / 8 {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        let ahead = from.as_ptr().wrapping_add(8 * line + 512).cast();
+        let ahead = from.as_ptr().wrapping_add(8 * line + AHEAD / 8).cast();
         // SAFETY: a prefetch may name any address.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(ahead) };
     }
