@@ -13,6 +13,14 @@ const LAST_STRAIN: [f32; 2] = [0.132, 0.14];
 /// Sweeps without contact after that, at most.
 const LAST_SWEEPS: u32 = 1000;
 
+/// Between two sweeps over all edges, this many go over those near their limit alone.
+const SHORT_SWEEPS: u32 = 15;
+/// An edge is near its limit within this strain of it.
+const NEAR: f32 = 0.03;
+
+/// Edges that a sweep goes over: end vertices and rest length.
+pub(crate) type Edge = ([u32; 2], f32);
+
 /// Gauss-Seidel over the edges in their order, shortened where too long (Provot 1995, with
 /// masses), in turn with the contact planes. Where planes, held vertices and edges contradict each
 /// other, as between an arm and the chest, the edges have the last word: then every vertex is
@@ -23,10 +31,10 @@ pub(crate) fn project(
     free: &[f32],
     rows: &[Row],
     x: &mut [Vec3A],
+    busy: &mut Vec<Edge>,
 ) -> u32 {
-    let edges = || mesh.edges().iter().copied().zip(mesh.rest_lengths().iter().copied());
     for sweep in 0..SWEEPS {
-        if shorten(edges(), STRAIN, inverse_masses, x) {
+        if shorten_in_turn(mesh, sweep, STRAIN, inverse_masses, x, busy) {
             return sweep;
         }
         for (x, row) in x.iter_mut().zip(rows) {
@@ -36,7 +44,7 @@ pub(crate) fn project(
         }
     }
     for sweep in 0..LAST_SWEEPS {
-        if shorten(edges(), LAST_STRAIN, free, x) {
+        if shorten_in_turn(mesh, sweep, LAST_STRAIN, free, x, busy) {
             return SWEEPS + sweep;
         }
     }
@@ -48,6 +56,33 @@ pub(crate) fn project(
 pub(crate) fn settle(mesh: &Mesh, inverse_masses: &[f32], x: &mut [Vec3A]) -> bool {
     let edges = mesh.edges().iter().copied().zip(mesh.rest_lengths().iter().copied());
     shorten(edges, LAST_STRAIN, inverse_masses, x)
+}
+
+/// A sweep over all edges, or one of those between over the busy ones; returns whether all edges
+/// were found short enough.
+fn shorten_in_turn(
+    mesh: &Mesh,
+    sweep: u32,
+    strain: [f32; 2],
+    inverse_masses: &[f32],
+    x: &mut [Vec3A],
+    busy: &mut Vec<Edge>,
+) -> bool {
+    let edges = mesh.edges().iter().copied().zip(mesh.rest_lengths().iter().copied());
+    if !sweep.is_multiple_of(SHORT_SWEEPS + 1) {
+        shorten(busy.iter().copied(), strain, inverse_masses, x);
+        return false;
+    }
+    if shorten(edges.clone(), strain, inverse_masses, x) {
+        return true;
+    }
+    busy.clear();
+    let near = 1.0 + strain[0] - NEAR;
+    busy.extend(edges.filter(|(e, rest)| {
+        let most = rest * near;
+        x[e[0] as usize].distance_squared(x[e[1] as usize]) > most * most
+    }));
+    false
 }
 
 /// Shortens edges between held vertices where the skin that leads them stretches too far.

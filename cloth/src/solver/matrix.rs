@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use glam::{Mat3A, Vec3A};
 
+use super::simd::{self, Set, Task};
 use crate::mesh::Mesh;
 use crate::solver::self_contact::Rows as PairRows;
 
@@ -13,8 +14,28 @@ use crate::solver::self_contact::Rows as PairRows;
 pub(crate) struct Pattern {
     pub(crate) near: Rows,
     pub(crate) far: Rows,
-    /// For each triangle the slots of its corner pairs 01, 10, 02, 20, 12, 21.
-    pub(crate) triangle_slots: Vec<[u32; 6]>,
+    /// What is stored of `near`.
+    pub(crate) near_upper: Upper,
+    /// What is stored of `far`.
+    pub(crate) far_upper: Upper,
+    /// For each triangle the places of its corner pairs 01, 02, 12.
+    pub(crate) triangle_places: Vec<[Place; 3]>,
+}
+
+/// The part right of the diagonal: the matrix is symmetric.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Upper {
+    pub(crate) rows: Rows,
+    /// For each slot of `rows` that of the whole rows.
+    pub(crate) whole: Vec<u32>,
+}
+
+/// The block of a pair of vertices.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Place {
+    pub(crate) slot: u32,
+    /// Whether the transposed block is stored.
+    pub(crate) turned: bool,
 }
 
 /// Columns of each row, ascending, without the diagonal.
@@ -28,7 +49,9 @@ pub(crate) struct Rows {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Matrix {
     pub(crate) diagonal: Vec<Mat3A>,
-    pub(crate) near: Vec<Mat3A>,
+    /// Right of the diagonal, column by column.
+    pub(crate) near: Vec<[f32; 9]>,
+    /// Right of the diagonal.
     pub(crate) far: Vec<f32>,
     /// What couples the vertices of pairs in contact; their diagonal blocks are in `diagonal`.
     pub(crate) pairs: PairRows,
@@ -37,7 +60,7 @@ pub(crate) struct Matrix {
 /// Scratch of the solver.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Scratch {
-    /// Before solving the right-hand side, after it what is left of it.
+    /// Before solving the right-hand side, after it the residual.
     pub(crate) residual: Vec<Vec3A>,
     inverse: Vec<Mat3A>,
     z: Vec<Vec3A>,
@@ -68,6 +91,7 @@ pub(crate) struct Stop {
 
 impl Rows {
     fn new(count: usize, mut pairs: Vec<(u32, u32)>) -> Self {
+        assert!(pairs.iter().all(|(a, b)| (*a as usize) < count && (*b as usize) < count));
         pairs.sort_unstable();
         pairs.dedup();
         let mut starts = vec![0u32; count + 1];
@@ -78,6 +102,11 @@ impl Rows {
             starts[row + 1] += starts[row];
         }
         Self { starts, columns: pairs.into_iter().map(|(_, column)| column).collect() }
+    }
+
+    /// Number of rows.
+    pub(crate) fn count(&self) -> usize {
+        self.starts.len() - 1
     }
 
     /// Slots of a row.
@@ -93,6 +122,22 @@ impl Rows {
     }
 }
 
+impl Upper {
+    fn new(whole: &Rows) -> Self {
+        let mut starts = vec![0];
+        let (mut columns, mut slots) = (Vec::new(), Vec::new());
+        for row in 0..whole.count() {
+            let right = whole.row(row).filter(|s| whole.columns[*s] as usize > row);
+            for slot in right {
+                columns.push(whole.columns[slot]);
+                slots.push(slot as u32);
+            }
+            starts.push(columns.len() as u32);
+        }
+        Self { rows: Rows { starts, columns }, whole: slots }
+    }
+}
+
 impl Pattern {
     /// The pattern of a mesh.
     pub(crate) fn new(mesh: &Mesh) -> Self {
@@ -102,62 +147,63 @@ impl Pattern {
         let across = mesh.hinges().iter().map(|h| (h.vertices[2], h.vertices[3]));
         let apart = across.filter(|(a, b)| a != b && near.slot(*a, *b).is_none());
         let far = Rows::new(count, apart.flat_map(|(a, b)| both(a, b)).collect());
-        let slot = |a, b| near.slot(a, b).map_or(0, |s| s as u32);
-        let slots = |t: &[u32; 3]| {
-            let [a, b, c] = *t;
-            [slot(a, b), slot(b, a), slot(a, c), slot(c, a), slot(b, c), slot(c, b)]
+        let (near_upper, far_upper) = (Upper::new(&near), Upper::new(&far));
+        let place = |a: u32, b: u32| {
+            let slot = near_upper.rows.slot(a.min(b), a.max(b)).map_or(0, |s| s as u32);
+            Place { slot, turned: a > b }
         };
-        let triangle_slots = mesh.triangles().iter().map(slots).collect();
-        Self { near, far, triangle_slots }
+        let places = |t: &[u32; 3]| [place(t[0], t[1]), place(t[0], t[2]), place(t[1], t[2])];
+        let triangle_places = mesh.triangles().iter().map(places).collect();
+        Self { near, far, near_upper, far_upper, triangle_places }
     }
 }
 
 impl Matrix {
-    /// `out = A x`.
-    pub(crate) fn multiply(&self, pattern: &Pattern, x: &[Vec3A], out: &mut [Vec3A]) {
-        for (row, out) in out.iter_mut().enumerate() {
-            let mut sum = self.diagonal[row] * x[row];
-            let near = pattern.near.row(row);
-            let blocks = &self.near[near.clone()];
-            for (block, column) in blocks.iter().zip(&pattern.near.columns[near]) {
-                sum += *block * x[*column as usize];
-            }
-            let far = pattern.far.row(row);
-            let scalars = &self.far[far.clone()];
-            for (scalar, column) in scalars.iter().zip(&pattern.far.columns[far]) {
-                sum += x[*column as usize] * *scalar;
-            }
-            *out = sum;
-        }
-        self.pairs.multiply(x, out);
+    /// Takes the size of a pattern; the values are whatever they were.
+    pub(crate) fn size(&mut self, pattern: &Pattern) {
+        self.diagonal.resize(pattern.near.count(), Mat3A::ZERO);
+        self.near.resize(pattern.near_upper.whole.len(), [0.0; 9]);
+        self.far.resize(pattern.far_upper.whole.len(), 0.0);
     }
 
-    /// Adds to `x` the solution of `A dx = s.residual` by conjugate gradients with the inverted
-    /// diagonal blocks as preconditioner. Returns the iterations.
+    /// Adds a block, given as for the pair's first vertex.
+    #[inline(always)]
+    pub(crate) fn add(&mut self, place: Place, block: &Mat3A) {
+        let whole = block.to_cols_array();
+        let sum = &mut self.near[place.slot as usize];
+        for (k, sum) in sum.iter_mut().enumerate() {
+            *sum += if place.turned { whole[k % 3 * 3 + k / 3] } else { whole[k] };
+        }
+    }
+
+    /// `out = A x`; returns `x . out`.
+    pub(crate) fn multiply(&self, pattern: &Pattern, x: &[Vec3A], out: &mut [Vec3A]) -> f32 {
+        let dot = simd::multiply(Set::detect(), self, pattern, x, out);
+        dot + self.pairs.multiply(x, out)
+    }
+
+    /// Improves `x` as a solution of `A x = b`, where `b` stands in `s.residual`, by conjugate
+    /// gradients with the inverted diagonal blocks as preconditioner. Returns the iterations.
     pub(crate) fn solve(&self, given: Given<'_>, x: &mut [Vec3A], s: &mut Scratch) -> u32 {
         let Given { pattern, held, reference, stop } = given;
         s.size(x.len());
+        self.multiply(pattern, x, &mut s.q);
         let mut floor = 0.0;
         for (row, inverse) in s.inverse.iter_mut().enumerate() {
             *inverse = if held[row] { Mat3A::ZERO } else { self.diagonal[row].inverse() };
             floor += reference[row].dot(*inverse * reference[row]);
+            s.residual[row] -= s.q[row];
         }
         let mut rz = s.precondition();
         let enough = stop.tolerance * stop.tolerance * rz.max(floor);
         s.p.copy_from_slice(&s.z);
         let mut iterations = 0;
         while rz > enough && iterations < stop.iterations {
-            self.multiply(pattern, &s.p, &mut s.q);
-            let curvature = dot(&s.p, &s.q);
+            let curvature = self.multiply(pattern, &s.p, &mut s.q);
             if !curvature.is_normal() || curvature < 0.0 {
                 break;
             }
-            let alpha = rz / curvature;
-            for (((x, r), p), q) in x.iter_mut().zip(&mut s.residual).zip(&s.p).zip(&s.q) {
-                *x += *p * alpha;
-                *r -= *q * alpha;
-            }
-            let next = s.precondition();
+            let next = simd::run(Advance { alpha: rz / curvature, x, s });
             let beta = next / rz;
             rz = next;
             for (p, z) in s.p.iter_mut().zip(&s.z) {
@@ -169,6 +215,33 @@ impl Matrix {
     }
 }
 
+/// `x += alpha p`, `r -= alpha q`, `z = D^-1 r`; gives `r . z`. Held rows give z = 0, so that they
+/// never move. (The product of a held row in `q` is meaningless and meets only zeros.)
+struct Advance<'a> {
+    alpha: f32,
+    x: &'a mut [Vec3A],
+    s: &'a mut Scratch,
+}
+
+impl Task for Advance<'_> {
+    type Output = f32;
+
+    #[inline(always)]
+    fn run(self) -> f32 {
+        let (alpha, s) = (self.alpha, self.s);
+        let mut sum = Vec3A::ZERO;
+        let ways = self.x.iter_mut().zip(&s.p).zip(&s.q);
+        let ends = s.residual.iter_mut().zip(&mut s.z).zip(&s.inverse);
+        for (((x, p), q), ((r, z), inverse)) in ways.zip(ends) {
+            *x += *p * alpha;
+            *r -= *q * alpha;
+            *z = *inverse * *r;
+            sum += *z * *r;
+        }
+        sum.element_sum()
+    }
+}
+
 impl Scratch {
     fn size(&mut self, count: usize) {
         self.inverse.resize(count, Mat3A::ZERO);
@@ -177,8 +250,7 @@ impl Scratch {
         }
     }
 
-    /// `z = D^-1 r`; returns `r . z`. Held rows give z = 0, so that they never move. (The product
-    /// of a held row in `q` is meaningless and meets only zeros.)
+    /// `z = D^-1 r`; returns `r . z`.
     fn precondition(&mut self) -> f32 {
         let mut sum = Vec3A::ZERO;
         for ((z, inverse), r) in self.z.iter_mut().zip(&self.inverse).zip(&self.residual) {
@@ -187,8 +259,4 @@ impl Scratch {
         }
         sum.element_sum()
     }
-}
-
-fn dot(a: &[Vec3A], b: &[Vec3A]) -> f32 {
-    a.iter().zip(b).fold(Vec3A::ZERO, |sum, (a, b)| sum + *a * *b).element_sum()
 }

@@ -57,8 +57,8 @@ pub(crate) fn assemble(
 ) {
     let Sums { forces, matrix } = sums;
     let shapes = mesh.shape_gradients().iter().zip(mesh.rest_areas());
-    for ((t, (gradients, area)), slots) in
-        mesh.triangles().iter().zip(shapes).zip(&pattern.triangle_slots)
+    for ((t, (gradients, area)), places) in
+        mesh.triangles().iter().zip(shapes).zip(&pattern.triangle_places)
     {
         let [i, j, k] = t.map(|v| v as usize);
         let e = Element::new([x[i], x[j], x[k]], gradients);
@@ -79,10 +79,10 @@ pub(crate) fn assemble(
             h02 += axes.block(g0, g2) * (area * scale);
             h12 += axes.block(g1, g2) * (area * scale);
         }
-        let (h10, h20, h21) = (h01.transpose(), h02.transpose(), h12.transpose());
-        for (slot, h) in slots.iter().zip([h01, h10, h02, h20, h12, h21]) {
-            matrix.near[*slot as usize] += h;
+        for (place, h) in places.iter().zip([&h01, &h02, &h12]) {
+            matrix.add(*place, h);
         }
+        let (h10, h20, h21) = (h01.transpose(), h02.transpose(), h12.transpose());
         // A shift of the whole triangle costs nothing: rows sum to zero.
         matrix.diagonal[i] -= h01 + h02;
         matrix.diagonal[j] -= h10 + h12;
@@ -239,12 +239,8 @@ mod tests {
     fn at(mesh: &Mesh, x: &[Vec3A], material: &Material) -> (Vec<Vec3A>, Matrix) {
         let pattern = Pattern::new(mesh);
         let mut forces = vec![Vec3A::ZERO; 3];
-        let mut matrix = Matrix {
-            diagonal: vec![Mat3A::ZERO; 3],
-            near: vec![Mat3A::ZERO; pattern.near.columns.len()],
-            far: Vec::new(),
-            ..Matrix::default()
-        };
+        let mut matrix = Matrix::default();
+        matrix.size(&pattern);
         let c = Constants::new(material);
         assemble(mesh, &pattern, c, 1.0, x, Sums { forces: &mut forces, matrix: &mut matrix });
         (forces, matrix)
@@ -293,12 +289,8 @@ mod tests {
                 mesh.rest_positions().iter().map(|p| moved(*p, strain).into()).collect();
             let pattern = Pattern::new(&mesh);
             let mut forces = vec![Vec3A::ZERO; 4];
-            let mut matrix = Matrix {
-                diagonal: vec![Mat3A::ZERO; 4],
-                near: vec![Mat3A::ZERO; pattern.near.columns.len()],
-                far: Vec::new(),
-                ..Matrix::default()
-            };
+            let mut matrix = Matrix::default();
+            matrix.size(&pattern);
             let sums = Sums { forces: &mut forces, matrix: &mut matrix };
             assemble(&mesh, &pattern, Constants::new(&material), 1.0, &x, sums);
             -(forces[side[0]] + forces[side[1]])[axis] / strain

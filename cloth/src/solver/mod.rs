@@ -1,7 +1,7 @@
-//! The step: implicit Euler, two projected Newton passes per substep.
+//! The step: implicit Euler, one projected Newton linearisation and two contact passes a substep.
 //!
 //! The first pass keeps the cloth off the contact planes found at the substep's beginning, the
-//! second, linearised where the first ended, off those found at its end. Baraff & Witkin 1998 for
+//! second, started where the first ended, off those found at its end. Baraff & Witkin 1998 for
 //! the implicit system, Kim & Eberle 2022 for projection; contact and limits as their modules say.
 
 pub(crate) mod bending;
@@ -11,6 +11,7 @@ pub(crate) mod matrix;
 pub(crate) mod membrane;
 pub(crate) mod recover;
 pub(crate) mod self_contact;
+pub(crate) mod simd;
 
 use glam::{Mat3A, Vec3, Vec3A};
 
@@ -90,8 +91,9 @@ pub struct Workspace {
     x: Vec<Vec3A>,
     v: Vec<Vec3A>,
     dx: Vec<Vec3A>,
-    guess: Vec<Vec3A>,
-    linear: Vec<Vec3A>,
+    /// The matrix's diagonal without contacts.
+    bare: Vec<Mat3A>,
+    ends: Vec<Vec3A>,
     forces: Vec<Vec3A>,
     normals: Vec<Vec3A>,
     reference: Vec<Vec3A>,
@@ -104,6 +106,7 @@ pub struct Workspace {
     free: Vec<f32>,
     recovery: Recovery,
     self_contact: SelfContact,
+    busy: Vec<limit::Edge>,
     matrix: Matrix,
     scratch: Scratch,
 }
@@ -166,7 +169,7 @@ impl Workspace {
         self.x.extend(state.positions.iter().map(|p| Vec3A::from(*p)));
         self.v.clear();
         self.v.extend(state.velocities.iter().map(|v| Vec3A::from(*v)));
-        for list in [&mut self.dx, &mut self.guess, &mut self.linear, &mut self.forces] {
+        for list in [&mut self.dx, &mut self.ends, &mut self.forces] {
             list.clear();
             list.resize(count, Vec3A::ZERO);
         }
@@ -176,9 +179,8 @@ impl Workspace {
         self.ground.resize(count, Row::default());
         self.loads.clear();
         self.loads.resize(count, [0.0; 2]);
-        self.matrix.diagonal.resize(count, Mat3A::ZERO);
-        self.matrix.near.resize(model.pattern.near.columns.len(), Mat3A::ZERO);
-        self.matrix.far.resize(model.pattern.far.columns.len(), 0.0);
+        self.bare.resize(count, Mat3A::ZERO);
+        self.matrix.size(&model.pattern);
         self.held.clear();
         self.held.resize(count, false);
         self.inverse_masses.clear();
@@ -225,12 +227,12 @@ impl Workspace {
         effort.substeps = effort.substeps.max(1);
         self.set_guess(model, dt);
         self.carry_rows(model, dt);
-        self.linear.fill(Vec3A::ZERO);
+        self.assemble(model, dt);
+        self.add_air(model, dt);
+        self.bare.copy_from_slice(&self.matrix.diagonal);
         effort.iterations += self.pass(model, dt, true);
         self.find_rows(model, dt, body_way);
         self.find_pairs(model);
-        self.linear.copy_from_slice(&self.dx);
-        self.guess.fill(Vec3A::ZERO);
         effort.iterations += self.pass(model, dt, false);
         self.finish(model, dt, effort);
     }
@@ -238,20 +240,20 @@ impl Workspace {
     /// First guess of the way of each vertex: on by its velocity; held vertices go where they
     /// are led.
     fn set_guess(&mut self, model: &Model, dt: f32) {
-        for (guess, v) in self.guess.iter_mut().zip(&self.v) {
+        for (guess, v) in self.dx.iter_mut().zip(&self.v) {
             *guess = *v * dt;
         }
         let Some(c) = &model.body else {
-            model.attachments.iter().for_each(|a| self.guess[a.vertex as usize] = Vec3A::ZERO);
+            model.attachments.iter().for_each(|a| self.dx[a.vertex as usize] = Vec3A::ZERO);
             return;
         };
         for a in &model.attachments {
-            self.linear[a.vertex as usize] = a.place(&c.surface, &self.to).into();
+            self.ends[a.vertex as usize] = a.place(&c.surface, &self.to).into();
         }
-        limit::tighten(&model.held_edges, &self.inverse_masses, &mut self.linear);
+        limit::tighten(&model.held_edges, &self.inverse_masses, &mut self.ends);
         for a in &model.attachments {
             let i = a.vertex as usize;
-            self.guess[i] = self.linear[i] - self.x[i];
+            self.dx[i] = self.ends[i] - self.x[i];
         }
     }
 
@@ -259,7 +261,7 @@ impl Workspace {
         let offset = model.material.offset;
         let fall = Vec3A::from(model.environment.gravity) * (dt * dt);
         for i in 0..self.x.len() {
-            let ahead = self.x[i] + self.guess[i] + fall;
+            let ahead = self.x[i] + self.dx[i] + fall;
             let mut row = Row::default();
             if let Some(c) = &model.body {
                 let near = &self.near[i];
@@ -310,73 +312,52 @@ impl Workspace {
         }
     }
 
-    /// One Newton pass: linearised at `linear`, started from `guess`, into `dx`.
+    /// Solves for the way `dx`, from the guess that stands there, with the contacts of this pass.
     fn pass(&mut self, model: &Model, dt: f32, first: bool) -> u32 {
         let stop = if first { FIRST } else { SECOND };
-        for ((at, x), way) in self.dx.iter_mut().zip(&self.x).zip(&self.linear) {
-            *at = *x + *way;
-        }
-        self.assemble(model, dt);
-        self.add_air(model, dt);
+        self.matrix.diagonal.copy_from_slice(&self.bare);
+        self.scratch.residual.copy_from_slice(&self.forces);
         self.add_contacts(model, dt, first);
         if !first && model.environment.self_contact {
             let pass = self_contact::Pass {
                 x: &self.x,
                 v: &self.v,
-                way: &self.linear,
+                way: &self.dx,
                 inverse_masses: &self.inverse_masses,
                 dt,
             };
             let force = &mut self.scratch.residual;
             self.self_contact.add_rows(model, pass, &mut self.matrix, force);
         }
-        let pattern = &model.pattern;
-        // The guess enters the residual; its held entries are what held vertices are led by.
-        self.matrix.multiply(pattern, &self.guess, &mut self.forces);
-        for (r, f) in self.scratch.residual.iter_mut().zip(&self.forces) {
-            *r -= *f;
-        }
         let (held, reference) = (&self.held[..], &self.reference[..]);
-        let given = Given { pattern, held, reference, stop };
-        let iterations = self.matrix.solve(given, &mut self.guess, &mut self.scratch);
-        for ((dx, way), more) in self.dx.iter_mut().zip(&self.linear).zip(&self.guess) {
-            *dx = *way + *more;
-        }
-        iterations
+        let given = Given { pattern: &model.pattern, held, reference, stop };
+        self.matrix.solve(given, &mut self.dx, &mut self.scratch)
     }
 
-    /// Matrix and residual of inertia, gravity, bending, membrane and damping; `dx` holds the
-    /// positions at which the forces are taken.
+    /// Matrix and right-hand side (in `forces`) of inertia, gravity, bending, membrane and damping,
+    /// linearised where the substep begins.
     fn assemble(&mut self, model: &Model, dt: f32) {
-        let lag = model.material.damping_s / dt;
-        let scale = 1.0 + lag;
+        let scale = 1.0 + model.material.damping_s / dt;
         let gravity = Vec3A::from(model.environment.gravity);
         let (matrix, bending) = (&mut self.matrix, &model.bending);
         matrix.pairs.0.clear();
-        for (block, w) in matrix.near.iter_mut().zip(&bending.near) {
-            *block = Mat3A::from_diagonal(Vec3::splat(w * scale));
+        for (block, slot) in matrix.near.iter_mut().zip(&model.pattern.near_upper.whole) {
+            let w = bending.near[*slot as usize] * scale;
+            *block = [w, 0.0, 0.0, 0.0, w, 0.0, 0.0, 0.0, w];
         }
-        for (far, w) in matrix.far.iter_mut().zip(&bending.far) {
-            *far = w * scale;
+        for (far, slot) in matrix.far.iter_mut().zip(&model.pattern.far_upper.whole) {
+            *far = bending.far[*slot as usize] * scale;
         }
-        for (d, w) in matrix.diagonal.iter_mut().zip(&bending.diagonal) {
-            *d = Mat3A::from_diagonal(Vec3::splat(w * scale));
+        for (i, (d, w)) in matrix.diagonal.iter_mut().zip(&bending.diagonal).enumerate() {
+            let inertia = model.masses[i] / (dt * dt);
+            *d = Mat3A::from_diagonal(Vec3::splat(w * scale + inertia));
+            self.forces[i] = gravity * model.masses[i] + self.v[i] * (dt * inertia);
         }
-        for (f, m) in self.forces.iter_mut().zip(&model.masses) {
-            *f = gravity * *m;
-        }
-        bending.add_forces(&model.pattern, &self.dx, &mut self.forces);
+        bending.add_forces(&model.pattern, &self.x, &mut self.forces);
         let constants = membrane::Constants::new(&model.material);
         let (mesh, pattern) = (&model.mesh, &model.pattern);
         let sums = membrane::Sums { forces: &mut self.forces, matrix: &mut *matrix };
-        membrane::assemble(mesh, pattern, constants, scale, &self.dx, sums);
-        matrix.multiply(pattern, &self.linear, &mut self.scratch.residual);
-        let damp = lag / scale;
-        for (i, r) in self.scratch.residual.iter_mut().enumerate() {
-            let m = model.masses[i] / (dt * dt);
-            *r = self.forces[i] - *r * damp + (self.v[i] * dt - self.linear[i]) * m;
-            matrix.diagonal[i] += Mat3A::from_diagonal(Vec3::splat(m));
-        }
+        membrane::assemble(mesh, pattern, constants, scale, &self.x, sums);
     }
 
     /// Drag on each vertex's share of the sheet, along the sheet's normal.
@@ -399,7 +380,7 @@ impl Workspace {
             let speed = n.dot(self.v[i] - wind);
             let c = factor * area * speed.abs() / dt;
             self.matrix.diagonal[i] += Mat3A::from_cols(n * n.x, n * n.y, n * n.z) * c;
-            self.scratch.residual[i] -= n * (n.dot(self.linear[i] - wind * dt) * c);
+            self.forces[i] += n * (n.dot(wind * dt) * c);
         }
     }
 
@@ -410,14 +391,14 @@ impl Workspace {
             if self.held[i] {
                 continue;
             }
-            let (x, dx, way) = (self.x[i], self.linear[i], self.v[i] * dt);
+            let (x, at, way) = (self.x[i], self.x[i] + self.dx[i], self.v[i] * dt);
             let diagonal = &mut self.matrix.diagonal[i];
             let force = &mut self.scratch.residual[i];
             let mut add = |row: &Row, coefficient, load| {
-                let acts = row.kind == Kind::Plane && (first || row.gap(x + dx) < 0.0);
+                let acts = row.kind == Kind::Plane && (first || row.gap(at) < 0.0);
                 if acts || row.kind == Kind::Held {
                     let friction = Friction { coefficient, load, way, dt };
-                    row.add(x, dx, friction, diagonal, force);
+                    row.add(x, Vec3A::ZERO, friction, diagonal, force);
                 }
             };
             add(&self.rows[i], model.material.friction, self.loads[i][0]);
@@ -427,7 +408,7 @@ impl Workspace {
 
     /// Strain limit, new velocities and positions.
     fn finish(&mut self, model: &Model, dt: f32, effort: &mut Effort) {
-        let ends = &mut self.linear;
+        let ends = &mut self.ends;
         for ((end, x), dx) in ends.iter_mut().zip(&self.x).zip(&self.dx) {
             *end = *x + *dx;
         }
@@ -438,8 +419,14 @@ impl Workspace {
         if own {
             self.self_contact.untangle(model, &self.inverse_masses, ends);
         }
-        let sweeps =
-            limit::project(&model.mesh, &self.inverse_masses, &self.free, &self.rows, ends);
+        let sweeps = limit::project(
+            &model.mesh,
+            &self.inverse_masses,
+            &self.free,
+            &self.rows,
+            ends,
+            &mut self.busy,
+        );
         effort.sweeps += sweeps;
         let mut moved = sweeps > 0;
         if own {

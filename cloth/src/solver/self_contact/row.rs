@@ -35,7 +35,7 @@ pub(crate) struct Pass<'a> {
     pub(crate) x: &'a [Vec3A],
     /// Velocities there (m/s).
     pub(crate) v: &'a [Vec3A],
-    /// Ways at which the pass is linearised (m).
+    /// Ways at which the rows are chosen (m).
     pub(crate) way: &'a [Vec3A],
     pub(crate) inverse_masses: &'a [f32],
     /// Substep (s).
@@ -71,7 +71,9 @@ impl SelfContact {
             let load = load.min(-gap * STIFFNESS);
             let drag = (model.material.friction * load / slip).min(STIFFNESS);
             let row = Row { vertices: pair.vertices, shares, normal, drag };
-            row.add(gap, mix(&shares, &way), &mut matrix.diagonal, force);
+            // The unknowns are whole ways: the force is that at none.
+            let far = gap - normal.dot(mix(&shares, &way));
+            row.add(far, &mut matrix.diagonal, force);
             matrix.pairs.0.push(row);
         }
     }
@@ -92,12 +94,12 @@ impl Pair {
 }
 
 impl Row {
-    fn add(&self, gap: f32, slip: Vec3A, diagonal: &mut [Mat3A], force: &mut [Vec3A]) {
+    fn add(&self, gap: f32, diagonal: &mut [Mat3A], force: &mut [Vec3A]) {
         let n = self.normal;
         let normal = Mat3A::from_cols(n * n.x, n * n.y, n * n.z);
         let block =
             normal * (STIFFNESS - self.drag) + Mat3A::from_diagonal(glam::Vec3::splat(self.drag));
-        let pull = n * (STIFFNESS * gap) + (slip - n * n.dot(slip)) * self.drag;
+        let pull = n * (STIFFNESS * gap);
         for (v, c) in self.vertices.iter().zip(self.shares) {
             diagonal[*v as usize] += block * (c * c);
             force[*v as usize] -= pull * c;
@@ -106,8 +108,10 @@ impl Row {
 }
 
 impl Rows {
-    /// `out += A x` for what couples different vertices; the diagonal is the matrix's.
-    pub(crate) fn multiply(&self, x: &[Vec3A], out: &mut [Vec3A]) {
+    /// `out += A x` for what couples different vertices; the diagonal is the matrix's. Returns what
+    /// this adds to `x . out`.
+    pub(crate) fn multiply(&self, x: &[Vec3A], out: &mut [Vec3A]) -> f32 {
+        let mut dot = 0.0;
         for row in &self.0 {
             let at = row.vertices.map(|v| x[v as usize]);
             let sum = mix(&row.shares, &at);
@@ -117,7 +121,9 @@ impl Rows {
                 let rest = sum - at[k] * c;
                 let pull = n * (n.dot(rest) * (STIFFNESS - row.drag)) + rest * row.drag;
                 out[row.vertices[k] as usize] += pull * c;
+                dot += at[k].dot(pull) * c;
             }
         }
+        dot
     }
 }
