@@ -32,8 +32,12 @@ pub enum Command {
     Play(Play),
     /// Show a served world, or a store, in the browser, and steer it.
     View(View),
-    /// Verify a store and say what is in it.
+    /// Verify a store and say what is in it; certify every merge, and replay some.
     Inspect(Inspect),
+    /// Draw a store's error curve, graph, states per pose and merge errors.
+    Plot(Plot),
+    /// Compare what a store plays with continuous simulation, skinning, and the floor of chaos.
+    Compare(Compare),
     /// Simulate a garment along a walk, without a graph, and measure it.
     Simulate(Simulate),
     /// Check a scene, draw it, or compute its motion graph.
@@ -199,12 +203,76 @@ pub struct View {
     pub listen: SocketAddr,
 }
 
+/// Where an explored store's working data and scene are.
+#[derive(Debug, Args)]
+pub struct Explored {
+    /// Working data of the explorer [default: beside a local store].
+    #[arg(long, value_name = "DIR")]
+    pub work: Option<PathBuf>,
+    /// The scene [default: the one that the store was explored with].
+    #[arg(long)]
+    pub scene: Option<String>,
+    /// Simulation threads [default: all cores].
+    #[arg(long)]
+    pub workers: Option<usize>,
+}
+
+/// `toile plot`.
+#[derive(Debug, Args)]
+pub struct Plot {
+    /// Object store: a folder or a URL.
+    #[arg(value_name = "STORE")]
+    pub store: String,
+    /// Folder for the SVG and PNG files.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Where things are.
+    #[command(flatten)]
+    pub explored: Explored,
+}
+
+/// `toile compare`.
+#[derive(Debug, Args)]
+pub struct Compare {
+    /// Object store: a folder or a URL.
+    #[arg(value_name = "STORE")]
+    pub store: String,
+    /// Walks.
+    #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    pub walks: u64,
+    /// Frames of each walk.
+    #[arg(long, default_value_t = 300)]
+    pub frames: usize,
+    /// Seed of the walks.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// States of the stages after the first; the last is always what the store shows
+    /// [default: 4906, 36073 and 99352, as in the paper].
+    #[arg(long, value_name = "N,N", value_delimiter = ',')]
+    pub stages: Option<Vec<u64>>,
+    /// Where things are.
+    #[command(flatten)]
+    pub explored: Explored,
+    /// One JSON object on the last line of stdout.
+    #[arg(long)]
+    pub json: bool,
+}
+
 /// `toile inspect`.
 #[derive(Debug, Args)]
 pub struct Inspect {
     /// Object store: a folder or a URL.
     #[arg(long, value_name = "URL|DIR")]
     pub store: String,
+    /// Write every merge with pose, clip, error, class and visits, and all bifurcations.
+    #[arg(long, value_name = "FILE.json")]
+    pub certificate: Option<PathBuf>,
+    /// Simulate so many merges' trajectories again and compare their errors.
+    #[arg(long, value_name = "K")]
+    pub replay: Option<usize>,
+    /// Where things are.
+    #[command(flatten)]
+    pub explored: Explored,
     /// One JSON object on the last line of stdout.
     #[arg(long)]
     pub json: bool,
@@ -271,6 +339,9 @@ pub enum SceneCommand {
         /// Median time to reach a given clip (s); smaller is denser [default: as the file says].
         #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
         density: Option<f32>,
+        /// The clips to be reached in that time, e.g. walk,run [default: the file's, or all].
+        #[arg(long, value_name = "CLIP,CLIP", value_delimiter = ',')]
+        to: Vec<String>,
         /// Where to write it (the format of `motion_graph.file`).
         #[arg(long, value_name = "FILE.json")]
         out: PathBuf,

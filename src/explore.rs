@@ -6,12 +6,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use explorer::cloth_simulator::ClothSimulatorFactory;
 use explorer::explore::{End, ExploreOptions, Place, Progress, Summary, explore};
 use explorer::grow::ledger::Phase;
+use explorer::pipe::simulators;
 use explorer::scene::Scene;
 
 use crate::live::Live;
+use crate::recall::Named;
 use crate::store::Opened;
 use crate::{args, format, place, scene, store};
 
@@ -21,6 +22,7 @@ pub fn run(a: args::Explore) -> Result<()> {
         ensure!(error.is_finite() && error >= 0.0, "--error {error}: millimetres, at least 0");
     }
     let scene = scene::load_with(&a.scene, a.vertices)?;
+    let named = Named::new(&a.scene, a.vertices);
     let opened = store::create_store(&a.store)?;
     let work = place::work(&opened, a.work)?;
     let stop = Stop::on_signals()?.after(a.time);
@@ -38,7 +40,7 @@ pub fn run(a: args::Explore) -> Result<()> {
     let mut live = Live::new(a.frames);
     let mut told = false;
     let mut version = None;
-    let summary = explore_blocking(&scene, &opened, work, &options, &mut |progress| {
+    let summary = explore_blocking(&scene, &named, &opened, work, &options, &mut |progress| {
         if let Some(failure) = &progress.failure {
             live.note(&format!("a job was given up: {failure}"));
         }
@@ -64,6 +66,7 @@ pub fn run(a: args::Explore) -> Result<()> {
 /// Explores on this thread until it ends.
 pub fn explore_blocking(
     scene: &Scene,
+    named: &Named,
     opened: &Opened,
     work: std::path::PathBuf,
     options: &ExploreOptions,
@@ -83,11 +86,12 @@ pub fn explore_blocking(
     }
     std::fs::create_dir_all(&work)
         .with_context(|| format!("the work folder {} cannot be made", work.display()))?;
+    named.leave(&work)?;
     let key = explorer::pack::load_or_make_key(&key_file)?;
-    let simulators = ClothSimulatorFactory::new(scene).context("setting up the simulation")?;
+    let simulators = simulators(scene).context("setting up the simulation")?;
     let (store, folder) = (Arc::clone(&opened.store), opened.folder.clone());
     let place = Place { store, folder, key, work };
-    Ok(runtime.block_on(explore(scene, &simulators, &place, options, progress))?)
+    Ok(runtime.block_on(explore(scene, &*simulators, &place, options, progress))?)
 }
 
 /// What the run will cost, by what a frame cost so far.

@@ -2,6 +2,7 @@
 
 mod args;
 mod clock;
+mod compare;
 mod decode_bench;
 mod explore;
 mod format;
@@ -11,6 +12,8 @@ mod lab_record;
 mod live;
 mod place;
 mod play;
+mod plot;
+mod recall;
 mod record;
 mod scene;
 mod serve;
@@ -34,6 +37,8 @@ fn main() -> ExitCode {
         Command::Play(a) => play::run(&a),
         Command::View(a) => view::run(&a),
         Command::Inspect(a) => inspect::run(&a),
+        Command::Plot(a) => plot::run(&a),
+        Command::Compare(a) => compare::run(a),
         Command::Simulate(a) => simulate::run(&a),
         Command::Scene(a) => scene::run(a),
         Command::Lab(a) => lab::run(a),

@@ -16,7 +16,7 @@ use crate::{args, format, place};
 pub fn run(a: args::Scene) -> Result<()> {
     match a.command {
         args::SceneCommand::Check { file, json } => check(&file, json),
-        args::SceneCommand::Graph { file, density, out } => graph(&file, density, &out),
+        args::SceneCommand::Graph { file, density, to, out } => graph(&file, density, &to, &out),
         args::SceneCommand::Picture { file, out } => {
             place::ensure_writable(&out)?;
             let scene = load(&file)?;
@@ -95,13 +95,13 @@ fn check(file: &str, json: bool) -> Result<()> {
     Ok(())
 }
 
-fn graph(file: &str, seconds: Option<f32>, out: &Path) -> Result<()> {
+fn graph(file: &str, seconds: Option<f32>, to: &[String], out: &Path) -> Result<()> {
     ensure!(file != "robe", "robe is built in with its own motion graph: there is none to compute");
     let sensible = seconds.is_none_or(|s| s.is_finite() && s > 0.0);
     ensure!(sensible, "--density {}: seconds, above 0", seconds.unwrap_or_default());
     place::ensure_writable(out)?;
     let density = seconds.map(Density::Reach);
-    let graph = scene_graph(file, data_dir().as_deref(), density)?;
+    let graph = scene_graph(file, data_dir().as_deref(), density, to)?;
     std::fs::write(out, graph.to_json()).with_context(|| format!("writing {}", out.display()))?;
     println!("{}: {} transitions", out.display(), graph.transitions.len());
     Ok(())

@@ -15,6 +15,7 @@ use server::{Server, ServerConfig};
 
 use crate::explore::{Stop, explore_blocking, line};
 use crate::live::Live;
+use crate::recall::Named;
 use crate::store::Opened;
 use crate::view::View;
 use crate::{args, format, place, scene, store};
@@ -68,7 +69,8 @@ pub fn run(a: &args::Up) -> Result<()> {
         should_stop: stop.asked(),
         ..ExploreOptions::default()
     };
-    let explorer = Explorer::start(scene, opened, work, options)?;
+    let named = Named::new(&a.scene, None);
+    let explorer = Explorer::start((scene, named), opened, work, options)?;
     let players = players(&server, a.players)?;
     let server_page = server.http_addr().map(|http| format!("http://{http}/"));
     let view = View::start(client(&server), a.page, server_page)?;
@@ -98,11 +100,16 @@ struct Explorer {
 }
 
 impl Explorer {
-    fn start(scene: Scene, opened: Opened, work: PathBuf, options: ExploreOptions) -> Result<Self> {
+    fn start(
+        (scene, named): (Scene, Named),
+        opened: Opened,
+        work: PathBuf,
+        options: ExploreOptions,
+    ) -> Result<Self> {
         let progress = Arc::new(Mutex::new(None));
         let shared = Arc::clone(&progress);
         let body = move || {
-            explore_blocking(&scene, &opened, work, &options, &mut |now| {
+            explore_blocking(&scene, &named, &opened, work, &options, &mut |now| {
                 *shared.lock().unwrap_or_else(PoisonError::into_inner) = Some(now.clone());
             })
         };

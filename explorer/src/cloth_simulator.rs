@@ -241,7 +241,7 @@ impl Simulator for ClothSimulator {
 }
 
 /// A grid state in the world, given its frame's place there.
-fn to_world(state: &GridState, hips: &Rigid) -> State {
+pub(crate) fn to_world(state: &GridState, hips: &Rigid) -> State {
     let vertices = 0..state.vertex_count();
     State {
         positions: vertices.clone().map(|v| hips.point(state.position(v))).collect(),
@@ -249,7 +249,7 @@ fn to_world(state: &GridState, hips: &Rigid) -> State {
     }
 }
 
-fn to_grid(world: &State, hips: &Rigid) -> Result<GridState, crate::grid::OffGrid> {
+pub(crate) fn to_grid(world: &State, hips: &Rigid) -> Result<GridState, crate::grid::OffGrid> {
     let inverse = hips.inverse();
     let positions: Vec<Vec3> = world.positions.iter().map(|p| inverse.point(*p)).collect();
     let velocities: Vec<Vec3> = world.velocities.iter().map(|v| inverse.vector(*v)).collect();

@@ -9,14 +9,17 @@
 pub mod builtin;
 pub mod certificate;
 pub mod cloth_simulator;
+pub mod compare;
 pub mod cpu;
 pub mod decode_bench;
 pub mod disk;
 pub mod explore;
+pub mod figures;
 pub mod grid;
 pub mod grow;
 pub mod import;
 pub mod pack;
+pub mod pipe;
 pub mod primary;
 pub mod scene;
 pub mod simulate;
@@ -24,6 +27,9 @@ pub mod simulator;
 pub mod telemetry;
 pub mod view;
 pub mod watchdog;
+
+/// The garment of a store that holds one: ids are given from 0 on and never taken back.
+pub const FIRST_GARMENT: protocol::GarmentId = protocol::GarmentId(0);
 
 /// The simulation kernel: its test bench and its fabrics are for the command line too.
 pub use cloth;

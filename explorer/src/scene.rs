@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use cloth::{Body, Vec3};
 
+use crate::pipe::Foreign;
 use crate::primary::PrimaryGraph;
 use protocol::PoseId;
 
@@ -24,6 +25,8 @@ pub struct Scene {
     pub exploration: ExplorationSettings,
     /// How states are compared, beyond [`ExplorationSettings::velocity_time_s`].
     pub metric: MetricSettings,
+    /// The program that simulates; `None`: our own kernel.
+    pub simulator: Option<Foreign>,
 }
 
 /// How vertices' distances become one distance.

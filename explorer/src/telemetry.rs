@@ -19,7 +19,7 @@ pub struct Walked {
     pub counts: BTreeMap<EdgeId, u64>,
 }
 
-/// Reads the batches behind number `after`. A batch that cannot be understood is passed over; it
+/// Reads the batches behind number `after` of one garment. A batch that cannot be understood is passed over; it
 /// costs its counts, never the run.
 ///
 /// # Errors

@@ -30,12 +30,14 @@
 //! | module | what |
 //! | --- | --- |
 //! | [`mod@glb`] | a moving clip of meshes as binary glTF, for Blender and others |
+//! | [`drawing`] | very many lines, as SVG and as a picture |
 //! | [`image`] | an RGB picture: fill, line, text, PNG in and out |
 //! | [`plot`] | line plots, as SVG and as a picture |
 //! | [`raster`] | meshes to a picture: z-buffer, two-sided shading, ground and its shadow |
 //! | [`sheet`] | a grid of pictures with captions |
 
 mod camera;
+pub mod drawing;
 mod font;
 pub mod glb;
 pub mod image;
@@ -44,6 +46,7 @@ pub mod raster;
 pub mod sheet;
 
 pub use camera::Camera;
+pub use drawing::Drawing;
 pub use glb::{Clip, ClipMesh, GlbError, glb};
 pub use image::{Image, ImageError, Rgb};
 pub use plot::{Plot, Series};

@@ -5,6 +5,8 @@
 mod axis;
 mod paint;
 
+pub(crate) use paint::escaped;
+
 use crate::image::{Image, ImageError, Rgb};
 use axis::Axis;
 use paint::{Anchor, Mark};

@@ -237,8 +237,9 @@ impl Session {
     }
 
     fn count(&self, telemetry: &Telemetry, dropped: u64) {
+        let Some(player) = self.player.as_ref().map(|player| player.number) else { return };
         let edge_count = self.shared.edge_count(telemetry.garment);
-        let (counted, stray) = lock(&self.shared.counts).add(telemetry, edge_count);
+        let (counted, stray) = lock(&self.shared.counts).add(player, telemetry, edge_count);
         let metrics = &self.shared.metrics;
         metrics.traversals.inc_by(counted);
         metrics.traversals_dropped.inc_by(dropped + stray);

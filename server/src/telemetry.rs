@@ -9,14 +9,26 @@ use protocol::{EdgeId, GarmentId};
 
 use crate::shared::{Shared, lock};
 
-/// Traversals by garment and edge.
+type Edges = BTreeMap<GarmentId, BTreeMap<EdgeId, u64>>;
+
+/// Traversals by player, garment and edge.
 #[derive(Debug, Default)]
-pub(crate) struct Counts(BTreeMap<GarmentId, BTreeMap<EdgeId, u64>>);
+pub(crate) struct Counts {
+    players: BTreeMap<u64, Edges>,
+    /// Weighed already, but refused by the store.
+    kept: Edges,
+}
 
 impl Counts {
-    /// Adds a report; says how many traversals were counted, and how many were dropped because the
-    /// garment does not have their edge. So memory is bounded by the primary graphs.
-    pub fn add(&mut self, telemetry: &Telemetry, edge_count: Option<u32>) -> (u64, u64) {
+    /// Adds a player's report; says how many traversals were counted, and how many were dropped
+    /// because the garment does not have their edge. So memory is bounded by the number of players
+    /// and the primary graphs.
+    pub fn add(
+        &mut self,
+        player: u64,
+        telemetry: &Telemetry,
+        edge_count: Option<u32>,
+    ) -> (u64, u64) {
         let (mut counted, mut dropped) = (0, 0);
         for &(edge, count) in &telemetry.edges {
             if edge.0 >= edge_count.unwrap_or(0) {
@@ -24,15 +36,38 @@ impl Counts {
                 continue;
             }
             counted += u64::from(count);
-            let edges = self.0.entry(telemetry.garment).or_default();
-            *edges.entry(edge).or_default() += u64::from(count);
+            let edges = self.players.entry(player).or_default();
+            *edges.entry(telemetry.garment).or_default().entry(edge).or_default() +=
+                u64::from(count);
         }
         (counted, dropped)
     }
 
+    /// All counts since the last time. A player weighs at most as much as the median player: one
+    /// who reports more counts in proportion, so that nobody steers the exploration alone.
     fn take(&mut self) -> Option<TelemetryBatch> {
-        let taken = std::mem::take(&mut self.0);
-        let garments = taken.into_iter().map(|(garment, edges)| {
+        let players = std::mem::take(&mut self.players);
+        let total = |edges: &Edges| edges.values().flat_map(BTreeMap::values).sum::<u64>();
+        let mut totals: Vec<u64> = players.values().map(total).collect();
+        totals.sort_unstable();
+        let median = totals.get(totals.len().saturating_sub(1) / 2).copied().unwrap_or(0);
+        let mut taken = std::mem::take(&mut self.kept);
+        for edges in players.values() {
+            let own = total(edges).max(1);
+            for (garment, counts) in edges {
+                let sums = taken.entry(*garment).or_default();
+                for (edge, count) in counts {
+                    // Both factors are at most a player's counts of one interval: u128 holds them.
+                    let weighed =
+                        u128::from(*count) * u128::from(median.min(own)) / u128::from(own);
+                    if weighed > 0 {
+                        *sums.entry(*edge).or_default() += weighed as u64;
+                    }
+                }
+            }
+        }
+        let garments = taken.into_iter().filter(|(_, edges)| !edges.is_empty());
+        let garments = garments.map(|(garment, edges)| {
             let edges = edges.into_iter().collect();
             GarmentCounts { garment, edges }
         });
@@ -42,7 +77,7 @@ impl Counts {
 
     fn put_back(&mut self, batch: TelemetryBatch) {
         for counts in batch.garments {
-            let edges = self.0.entry(counts.garment).or_default();
+            let edges = self.kept.entry(counts.garment).or_default();
             for (edge, count) in counts.edges {
                 *edges.entry(edge).or_default() += count;
             }
@@ -91,4 +126,37 @@ fn keep(shared: &Shared, batch: TelemetryBatch, error: &crate::store::ReadError)
     tracing::warn!(%error, "telemetry is kept for later");
     shared.metrics.store_failures.inc();
     lock(&shared.counts).put_back(batch);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn report(edges: &[(u32, u32)]) -> Telemetry {
+        let edges = edges.iter().map(|(edge, count)| (EdgeId(*edge), *count)).collect();
+        let garment = GarmentId(0);
+        let version = protocol::VersionNumber(1);
+        Telemetry { garment, version, edges, exact: 0, substituted: 0, missed: 0, jumps: 0 }
+    }
+
+    #[test]
+    fn one_player_weighs_no_more_than_the_median() {
+        let mut counts = Counts::default();
+        for player in 0..4 {
+            assert_eq!(counts.add(player, &report(&[(0, 200), (1, 100)]), Some(9)), (300, 0));
+        }
+        counts.add(9, &report(&[(5, 4_000_000_000), (6, 400_000_000)]), Some(9));
+        counts.add(9, &report(&[(70, 3)]), Some(9));
+        let batch = counts.take().unwrap();
+        let edges = |batch: &TelemetryBatch| batch.garments[0].edges.clone();
+        let expected = [(0, 800), (1, 400), (5, 272), (6, 27)];
+        assert_eq!(edges(&batch), expected.map(|(edge, count)| (EdgeId(edge), count)));
+        // What the store refused is weighed once only.
+        counts.put_back(batch.clone());
+        assert_eq!(counts.take(), Some(batch));
+        assert_eq!(counts.take(), None);
+        // A player alone counts in full.
+        counts.add(3, &report(&[(2, 7)]), Some(9));
+        assert_eq!(edges(&counts.take().unwrap()), [(EdgeId(2), 7)]);
+    }
 }

@@ -97,6 +97,7 @@ pub fn robe(vertices: Option<usize>) -> Result<Scene, BuiltinError> {
             ..ExplorationSettings::default()
         },
         metric: MetricSettings::default(),
+        simulator: None,
     })
 }
 

@@ -151,6 +151,7 @@ impl Header {
             text("ground", e.ground.to_string()),
             text("metric", metric(scene)),
             text("classes", digest(&classes(scene))),
+            text("simulator", simulator(scene)),
             text("--paper", paper.to_string()),
         ];
         let vertex_count = scene.garment.positions.len() as u32;
@@ -253,6 +254,11 @@ fn garment(scene: &Scene) -> Hasher {
                 .into_iter()
                 .chain(f.weft),
         )
+}
+
+/// The program's command, or `toile`.
+fn simulator(scene: &Scene) -> String {
+    scene.simulator.as_ref().map_or("toile".into(), |foreign| foreign.command.join(" "))
 }
 
 /// The norm, and a digest of the weights where there are any.

@@ -79,6 +79,7 @@ pub fn scene(primary: PrimaryGraph, exploration: ExplorationSettings) -> Scene {
         garment,
         exploration,
         metric: MetricSettings::default(),
+        simulator: None,
     }
 }
 

@@ -58,6 +58,9 @@ pub enum ComputeError {
         /// Its length.
         frames: usize,
     },
+    /// A clip to be reached that is not there.
+    #[error("there is no clip {0:?} to reach; the character has {1}")]
+    NoSuchClip(String, String),
     /// The density asked for cannot be had.
     #[error(
         "a median of {asked_s} s to reach a clip cannot be had: with all {transitions} transitions \
@@ -78,13 +81,16 @@ pub enum ComputeError {
 /// Cost: proportional to the square of the number of frames (9.7 million pairs of 27 joints take
 /// about two seconds on one core); memory for one pair of clips at a time.
 ///
+/// * `to`: the clips whose reach [`Density::Reach`] speaks of; none: all.
+///
 /// # Errors
-/// No clip, one that is too short, or a density that cannot be had.
+/// No clip, one that is too short or not there, or a density that cannot be had.
 pub fn compute(
     skeleton: &Skeleton,
     clips: &[Clip],
     fps: f32,
     density: Density,
+    to: &[String],
 ) -> Result<Vec<Transition>, ComputeError> {
     if clips.is_empty() {
         return Err(ComputeError::NoClip);
@@ -93,17 +99,34 @@ pub fn compute(
         let (clip, frames) = (clip.name.clone(), clip.poses.len());
         return Err(ComputeError::Short { clip, frames });
     }
+    let to = named(clips, to)?;
     let tracks = transition::tracks(skeleton, clips);
     let mut found = Found::search(&tracks);
     let frames: Vec<usize> = clips.iter().map(|c| c.poses.len()).collect();
     let mut chosen = found.ways();
     join(&tracks, &frames, &mut chosen);
     found.minima.sort_by(nearer);
-    let taken: BTreeSet<_> = chosen.iter().map(place).collect();
+    let mut taken: BTreeSet<_> = chosen.iter().map(place).collect();
     found.minima.retain(|t| !taken.contains(&place(t)));
+    if let Density::Reach(asked_s) = density {
+        let near = found.minima.partition_point(|t| t.distance_m < DISTANCE_M_MAX);
+        let all: Vec<_> = chosen.iter().chain(&found.minima[..near]).copied().collect();
+        if Reach::to_clips(&frames, &all, fps, &to).median_s > asked_s {
+            // Then also where each frame fits best, whether or not its neighbours fit better.
+            taken.extend(found.minima.iter().map(place));
+            found.minima.truncate(near);
+            let rows = found.rows.iter().filter(|t| to.contains(&t.to_clip));
+            let mut rows: Vec<_> = rows.filter(|t| !taken.contains(&place(t))).copied().collect();
+            rows.sort_by(nearer);
+            found.minima.extend(rows);
+        }
+    }
     let more = match density {
         Density::Threshold(limit_m) => found.minima.partition_point(|t| t.distance_m < limit_m),
-        Density::Reach(asked_s) => enough(&found.minima, &chosen, &frames, fps, asked_s)?,
+        Density::Reach(asked_s) => {
+            let candidates = (&found.minima[..], &chosen[..]);
+            enough(candidates, (&frames, fps), &to, asked_s)?
+        }
     };
     chosen.extend_from_slice(&found.minima[..more]);
     chosen.sort_by_key(place);
@@ -133,6 +156,20 @@ pub fn to_file(clips: &[Clip], fps: f32, transitions: &[Transition]) -> GraphFil
     }
 }
 
+/// Places of the named clips; all where none is named.
+fn named(clips: &[Clip], names: &[String]) -> Result<Vec<usize>, ComputeError> {
+    if names.is_empty() {
+        return Ok((0..clips.len()).collect());
+    }
+    let place = |name: &String| {
+        clips.iter().position(|clip| clip.name == *name).ok_or_else(|| {
+            let all: Vec<&str> = clips.iter().map(|clip| clip.name.as_str()).collect();
+            ComputeError::NoSuchClip(name.clone(), all.join(", "))
+        })
+    };
+    names.iter().map(place).collect()
+}
+
 fn place(t: &Transition) -> (usize, usize, usize, usize) {
     (t.from_clip, t.from_frame, t.to_clip, t.to_frame)
 }
@@ -143,16 +180,15 @@ fn nearer(a: &Transition, b: &Transition) -> Ordering {
 
 /// The smallest number of further transitions that reaches the density asked for.
 fn enough(
-    minima: &[Transition],
-    chosen: &[Transition],
-    frames: &[usize],
-    fps: f32,
+    (minima, chosen): (&[Transition], &[Transition]),
+    (frames, fps): (&[usize], f32),
+    to: &[usize],
     asked_s: f32,
 ) -> Result<usize, ComputeError> {
-    let most = minima.partition_point(|t| t.distance_m < DISTANCE_M_MAX);
+    let most = minima.iter().filter(|t| t.distance_m < DISTANCE_M_MAX).count();
     let median_s = |more: usize| {
         let all: Vec<_> = chosen.iter().chain(&minima[..more]).copied().collect();
-        Reach::of_clips(frames, &all, fps).median_s
+        Reach::to_clips(frames, &all, fps, to).median_s
     };
     let best_s = median_s(most);
     if best_s > asked_s {
@@ -171,6 +207,8 @@ fn enough(
 struct Found {
     clips: usize,
     minima: Vec<Transition>,
+    /// Where each frame goes on best in each other clip.
+    rows: Vec<Transition>,
     /// The best exit out of the end of a clip into each clip; `clips * clips`, by (from, to).
     exits: Vec<Option<Transition>>,
     /// The best entry into the beginning of a clip from each clip; by (from, to).
@@ -181,17 +219,21 @@ impl Found {
     fn search(tracks: &[JointTrack]) -> Self {
         let clips = tracks.len();
         let columns: Vec<Columns> = tracks.iter().map(Columns::new).collect();
-        let (mut minima, mut exits, mut entries) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut minima, mut rows) = (Vec::new(), Vec::new());
+        let (mut exits, mut entries) = (Vec::new(), Vec::new());
         for from in 0..clips {
             for to in 0..clips {
                 let table = Table::new(from, to, &columns[from], &columns[to]);
                 minima.extend(table.minima());
+                if from != to {
+                    rows.extend(table.row_minima());
+                }
                 let (last, first) = (end_frames(table.rows), end_frames(table.columns));
                 exits.push(table.best(|row, _| row + last >= table.rows));
                 entries.push(table.best(|_, column| column < first));
             }
         }
-        Self { clips, minima, exits, entries }
+        Self { clips, minima, rows, exits, entries }
     }
 
     /// The guaranteed exits and entries: the best ones, to and from different clips. Another clip
@@ -364,6 +406,16 @@ impl Table {
         minima
     }
 
+    /// The best place to go on, of every row that has one near enough.
+    fn row_minima(&self) -> Vec<Transition> {
+        let best = |row: usize| {
+            let columns = (0..self.columns).filter(|column| self.allowed(row, *column));
+            columns.map(|column| self.transition(row, column)).min_by(nearer)
+        };
+        let near = |t: &Transition| t.distance_m < DISTANCE_M_MAX;
+        (0..self.rows).filter_map(best).filter(near).collect()
+    }
+
     /// Smaller than its eight neighbours; of equals the first counts.
     fn is_minimum(&self, row: usize, column: usize) -> bool {
         let here = self.at(row, column);
@@ -444,7 +496,7 @@ mod tests {
         let frames: Vec<usize> = clips.iter().map(|c| c.poses.len()).collect();
         let mut last_s = f32::INFINITY;
         for limit_m in [0.0, 0.05, 0.2] {
-            let all = compute(&skeleton, &clips, 30.0, Density::Threshold(limit_m)).unwrap();
+            let all = compute(&skeleton, &clips, 30.0, Density::Threshold(limit_m), &[]).unwrap();
             let reach = Reach::of_clips(&frames, &all, 30.0);
             assert!(reach.median_s <= last_s);
             last_s = reach.median_s;
@@ -455,17 +507,24 @@ mod tests {
             let again = GraphFile::parse(&file.to_json()).unwrap();
             assert_eq!(again.resolve(&clips, 30.0).unwrap().len(), all.len());
         }
-        let asked = compute(&skeleton, &clips, 30.0, Density::Reach(last_s)).unwrap();
+        let asked = compute(&skeleton, &clips, 30.0, Density::Reach(last_s), &[]).unwrap();
         assert!(Reach::of_clips(&frames, &asked, 30.0).median_s <= last_s);
-        let error = compute(&skeleton, &clips, 30.0, Density::Reach(0.01)).unwrap_err();
+        let error = compute(&skeleton, &clips, 30.0, Density::Reach(0.01), &[]).unwrap_err();
         assert!(matches!(error, ComputeError::Unreachable { .. }));
+        // One clip alone can be reached faster than both.
+        let run = ["run".to_owned()];
+        let faster_s = 0.7 * last_s;
+        let dense = compute(&skeleton, &clips, 30.0, Density::Reach(faster_s), &run).unwrap();
+        assert!(Reach::to_clips(&frames, &dense, 30.0, &[1]).median_s <= faster_s);
+        let error = compute(&skeleton, &clips, 30.0, Density::Reach(1.0), &["hop".into()]);
+        assert!(error.unwrap_err().to_string().contains("\"hop\""));
     }
 
     #[test]
     fn short_clips_are_refused_by_name() {
         let (skeleton, mut clips) = synthetic::two_walks();
         clips[1].poses.truncate(20);
-        let error = compute(&skeleton, &clips, 30.0, Density::Threshold(0.1)).unwrap_err();
+        let error = compute(&skeleton, &clips, 30.0, Density::Threshold(0.1), &[]).unwrap_err();
         assert!(error.to_string().contains("clip \"run\" has 20 frames"), "{error}");
     }
 }

@@ -49,6 +49,8 @@ use crate::scene::{Garment, MetricSettings, Scene};
 
 /// The TOML of the scene `dress`.
 const DRESS: &str = include_str!("../../../scenes/dress.toml");
+/// The TOML of the scene `dress-agile`.
+const DRESS_AGILE: &str = include_str!("../../../scenes/dress-agile.toml");
 
 /// Why a scene could not be loaded: always the file, the place in it and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -182,6 +184,7 @@ pub fn data_dir() -> Option<PathBuf> {
 /// Computes the motion graph of a scene's character (`dress` or a file; not a built-in one).
 ///
 /// * `density`: `None` takes what the scene file asks for.
+/// * `to`: the clips to be reached; none: those of the scene file, or all.
 ///
 /// # Errors
 /// As for [`load_scene`]; also where no density is given at all.
@@ -189,6 +192,7 @@ pub fn scene_graph(
     name_or_path: &str,
     data_dir: Option<&Path>,
     density: Option<Density>,
+    to: &[String],
 ) -> Result<GraphFile, SceneError> {
     let (text, path) = scene_text(name_or_path)?;
     let place = Place { scene: &path, data: data_dir };
@@ -203,17 +207,20 @@ pub fn scene_graph(
             }));
         }
     };
+    let to = if to.is_empty() { &file.motion_graph.reach_clips[..] } else { to };
     let character = load_character(&file, &place)?;
     let transitions =
-        compute::compute(&character.body.skeleton, &character.clips, file.fps, density)
+        compute::compute(&character.body.skeleton, &character.clips, file.fps, density, to)
             .map_err(|source| SceneError::Compute { path: path.clone(), source })?;
     Ok(compute::to_file(&character.clips, file.fps, &transitions))
 }
 
 /// The text of a scene file and where it lies.
 fn scene_text(name_or_path: &str) -> Result<(String, PathBuf), SceneError> {
-    if name_or_path == "dress" {
-        return Ok((DRESS.to_owned(), PathBuf::from("scenes/dress.toml")));
+    for (name, text) in [("dress", DRESS), ("dress-agile", DRESS_AGILE)] {
+        if name_or_path == name {
+            return Ok((text.to_owned(), PathBuf::from(format!("scenes/{name}.toml"))));
+        }
     }
     let path = PathBuf::from(name_or_path);
     let text = String::from_utf8(read(&path, "the command line")?).map_err(|_| {
@@ -273,6 +280,7 @@ fn load_text_with(
         garment,
         exploration: file.exploration().map_err(|e| place.error(e))?,
         metric,
+        simulator: file.simulator(place.folder()).map_err(|e| place.error(e))?,
     };
     Ok(Loaded { scene, graph: Some(graph) })
 }
@@ -285,6 +293,11 @@ struct Place<'a> {
 impl Place<'_> {
     fn error(&self, source: SceneFileError) -> SceneError {
         SceneError::File { path: self.scene.to_owned(), source }
+    }
+
+    fn folder(&self) -> PathBuf {
+        let folder = self.scene.parent().unwrap_or(Path::new(""));
+        std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned())
     }
 
     fn resolve(&self, key: &str, written: &str) -> Result<PathBuf, SceneError> {
@@ -335,7 +348,8 @@ fn transitions(
         }
         MotionSource::Computed(density) => {
             let path = place.scene.to_owned();
-            match compute::compute(skeleton, &character.clips, file.fps, *density) {
+            let to = &file.motion_graph.reach_clips;
+            match compute::compute(skeleton, &character.clips, file.fps, *density, to) {
                 Ok(transitions) => Ok((path, transitions)),
                 Err(source) => Err(SceneError::Compute { path, source }),
             }

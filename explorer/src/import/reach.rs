@@ -27,11 +27,18 @@ impl Reach {
             let pose = &primary.poses()[pose];
             (!pose.transition).then_some(usize::from(pose.clip))
         };
-        Self::measure(&graph, &clip_of, primary.clips().len(), primary.fps())
+        let all: Vec<usize> = (0..primary.clips().len()).collect();
+        Self::measure(&graph, &clip_of, &all, primary.fps())
     }
 
     /// Of clips and transitions, over the component that would be kept.
     pub fn of_clips(frames: &[usize], transitions: &[Transition], fps: f32) -> Self {
+        let all: Vec<usize> = (0..frames.len()).collect();
+        Self::to_clips(frames, transitions, fps, &all)
+    }
+
+    /// As [`Reach::of_clips`], of walks to these clips alone.
+    pub fn to_clips(frames: &[usize], transitions: &[Transition], fps: f32, to: &[usize]) -> Self {
         let topology = Topology::new(frames, transitions, true);
         let graph = topology.digraph();
         let kept = graph.largest_cycle_component();
@@ -44,18 +51,18 @@ impl Reach {
         let ends: Vec<u32> =
             (0..frames.len()).map(|clip| topology.clip_first[clip] + frames[clip] as u32).collect();
         let clip_of = |node: usize| ends.iter().position(|end| kept[node] < *end);
-        Self::measure(&Digraph::new(kept.len(), &edges), &clip_of, frames.len(), fps)
+        Self::measure(&Digraph::new(kept.len(), &edges), &clip_of, to, fps)
     }
 
     fn measure(
         graph: &Digraph,
         clip_of: &dyn Fn(usize) -> Option<usize>,
-        clips: usize,
+        to: &[usize],
         fps: f32,
     ) -> Self {
         let clip: Vec<Option<usize>> = (0..graph.node_count()).map(clip_of).collect();
         let mut steps = Vec::new();
-        for target in 0..clips {
+        for &target in to {
             let inside = |node: &u32| clip[*node as usize] == Some(target);
             let targets: Vec<u32> = (0..graph.node_count() as u32).filter(inside).collect();
             steps.extend(graph.steps_to(&targets).into_iter().filter(|s| *s > 0));

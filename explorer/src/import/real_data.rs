@@ -148,7 +148,7 @@ fn the_dress_is_reported() {
 fn a_graph_computed_from_the_clips_keeps_nearly_all_of_them() {
     let Some(data) = data() else { return };
     for density in [Density::Threshold(0.1), Density::Reach(6.0)] {
-        let file = scene_graph("dress", Some(&data), Some(density)).unwrap();
+        let file = scene_graph("dress", Some(&data), Some(density), &[]).unwrap();
         let Character { body, clips } = character(&data);
         let transitions = file.resolve(&clips, 30.0).unwrap();
         let frames: Vec<usize> = clips.iter().map(|c| c.poses.len()).collect();

@@ -28,6 +28,7 @@
 //! tolerance_mm = 10.0
 //! ```
 //!
+//! `[simulator]` with `command` and `timeout_s` names a program: [`crate::pipe`].
 //! `[exploration.metric]` and `[[exploration.class]]`: see [`super::metric`].
 
 use std::collections::BTreeMap;
@@ -39,6 +40,7 @@ use serde::Deserialize;
 use super::compute::Density;
 use super::garment::Attachment;
 use super::metric::{ClassTable, MetricTable};
+use crate::pipe::Foreign;
 use crate::scene::{ExplorationSettings, Fabric};
 
 /// Frames per second that a scene may have.
@@ -83,6 +85,15 @@ pub struct SceneFile {
     /// How far to explore.
     #[serde(default)]
     pub exploration: ExplorationTable,
+    simulator: Option<SimulatorTable>,
+}
+
+/// A program that simulates.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SimulatorTable {
+    command: Vec<String>,
+    timeout_s: Option<f32>,
 }
 
 /// A frame of a clip.
@@ -117,6 +128,9 @@ pub struct MotionGraphTable {
     pub threshold_m: Option<f32>,
     /// Take as few local minima as bring the median time to reach a clip below this (s).
     pub reach_s: Option<f32>,
+    /// The clips that `reach_s` speaks of; none: all.
+    #[serde(default)]
+    pub reach_clips: Vec<String>,
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -230,6 +244,7 @@ impl SceneFile {
         let garment = file.garment()?;
         named("garment.name", garment.name.as_ref().unwrap_or(&file.name))?;
         file.motion_source()?;
+        file.simulator(PathBuf::new())?;
         file.exploration()?;
         Ok(file)
     }
@@ -252,6 +267,20 @@ impl SceneFile {
         }
         garment.attachments()?;
         Ok(garment)
+    }
+
+    /// The program that simulates, if one is named; it runs in `folder`.
+    ///
+    /// # Errors
+    /// No command, or a value out of range.
+    pub fn simulator(&self, folder: PathBuf) -> Result<Option<Foreign>, SceneFileError> {
+        let Some(table) = &self.simulator else { return Ok(None) };
+        if table.command.is_empty() {
+            return Err(value("simulator.command", "give the program and its arguments"));
+        }
+        let timeout_s = table.timeout_s.unwrap_or(60.0);
+        in_range("simulator.timeout_s", timeout_s, [0.01, 1e5])?;
+        Ok(Some(Foreign { command: table.command.clone(), folder, timeout_s }))
     }
 
     /// Where transitions come from.

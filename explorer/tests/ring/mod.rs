@@ -130,6 +130,7 @@ pub fn scene() -> Scene {
         garment,
         exploration: ExplorationSettings::default(),
         metric: MetricSettings::default(),
+        simulator: None,
     }
 }
 

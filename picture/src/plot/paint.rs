@@ -117,7 +117,7 @@ fn hex([r, g, b]: Rgb) -> String {
 }
 
 /// Text that no name can turn into markup; control characters, which XML forbids, become spaces.
-fn escaped(text: &str) -> String {
+pub(crate) fn escaped(text: &str) -> String {
     let mut out = String::new();
     for character in text.chars() {
         match character {
