@@ -369,6 +369,29 @@ pub struct Codec {
 pub enum CodecCommand {
     /// Time decoding at the papers' dimensions beside the speed of this machine's memory.
     DecodeBench(DecodeBench),
+    /// Encode the states of an explored store with every codec: bytes, errors, times.
+    Bench(CodecBench),
+}
+
+/// `toile codec bench`.
+#[derive(Debug, Args)]
+pub struct CodecBench {
+    /// Object store: a folder or a URL.
+    #[arg(value_name = "STORE")]
+    pub store: String,
+    /// Work folder that it was explored in, which holds the exact states [default: beside a local
+    /// store].
+    #[arg(long, value_name = "DIR")]
+    pub work: Option<PathBuf>,
+    /// Also a codec that keeps every vertex within this distance (mm).
+    #[arg(long, value_name = "MM", allow_negative_numbers = true)]
+    pub bound_mm: Option<f32>,
+    /// At most so many states, whole regions spread evenly [default: all].
+    #[arg(long)]
+    pub states: Option<usize>,
+    /// One JSON object on the last line of stdout.
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `toile codec decode-bench`.

@@ -2,6 +2,7 @@
 
 mod args;
 mod clock;
+mod codec;
 mod compare;
 mod decode_bench;
 mod explore;
@@ -44,6 +45,7 @@ fn main() -> ExitCode {
         Command::Lab(a) => lab::run(a),
         Command::Codec(a) => match a.command {
             args::CodecCommand::DecodeBench(a) => decode_bench::run(&a),
+            args::CodecCommand::Bench(a) => codec::bench(&a),
         },
     };
     match done {

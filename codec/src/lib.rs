@@ -31,14 +31,18 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! Map: [`kim2013`] the first profile's bitstream; [`basis`] the resident columns; [`kernel`] the
-//! SIMD room. The byte tables stand in docs/formats.md.
+//! Map: [`kim2013`] the first profile's bitstream; [`toile`] the bounded one, over [`entropy`];
+//! [`basis`] the resident columns; [`kernel`] the SIMD room. The byte tables stand in docs/formats.md.
 
 pub mod basis;
+pub mod decoder;
+pub mod entropy;
 pub mod kernel;
 pub mod kim2013;
+pub mod toile;
 
 pub use basis::{AppendError, Basis, ReconstructError};
+pub use decoder::{DecodedRegion, Decoder, DecoderError, VertexFix};
 
 /// Rows of a basis: three per vertex.
 pub const ROWS_MAX: usize = 3 << 20;

@@ -128,6 +128,11 @@ impl<'a> Region<'a> {
         self.columns
     }
 
+    /// All coefficients, state after state, in steps of 1/32,767 of full scale.
+    pub fn coefficients(&self) -> impl Iterator<Item = i16> + use<'a> {
+        self.coefficients.chunks_exact(2).map(|c| i16::from_le_bytes([c[0], c[1]]))
+    }
+
     /// Coefficients of one state in fractions of full scale (-1..=1, or a hair beyond for bytes
     /// that no encoder writes), into the first `columns` places of `out`; the rest become 0.
     ///

@@ -86,6 +86,22 @@ impl StateFile {
         Ok(file)
     }
 
+    /// Opens a file to read what is in it, whatever the journal says, also while an explorer is at
+    /// work.
+    ///
+    /// # Errors
+    /// The file cannot be read or is no state file.
+    pub fn view(path: &Path) -> io::Result<Self> {
+        let file = File::open(path)?;
+        let mut found = [0; HEADER_BYTES];
+        files::read_at(&file, &mut found, 0)?;
+        let vertex_count = u32::from_le_bytes([found[8], found[9], found[10], found[11]]);
+        if found[..8] != *MAGIC || vertex_count == 0 {
+            return Err(io::Error::other("this is no state file"));
+        }
+        Ok(Self { file, vertex_count: vertex_count as usize })
+    }
+
     /// Vertices of a state.
     pub fn vertex_count(&self) -> usize {
         self.vertex_count

@@ -1,20 +1,50 @@
-//! Encoding with profile `kim2013`: what is worth keeping, and how far off it is.
+//! Encoding, whatever the profile: fitting states to columns, and how far off they are.
 //!
 //! Every region is decoded again as a client decodes it, and every vertex of every state compared.
 
 use std::sync::Arc;
 
-use codec::kim2013::{self, FULL_SCALE, Generation, GenerationError, QuantiseError, Region};
+use codec::kim2013::{self, FULL_SCALE};
+use codec::toile::{self, Model, Tree};
 use codec::{AppendError, Basis};
 use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
 
-use super::basis::{BasisError, Columns, StreamingSvd, stay_on_this_thread};
+use super::basis::{BasisError, stay_on_this_thread};
+use super::design::Bound;
+use super::{bounded, fixed_bits};
+
+/// How coefficients become bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Profile {
+    /// 16 bits a coefficient, as in Kim et al. 2013, section 4.
+    Kim2013,
+    /// Bounded, predicted and entropy-coded.
+    #[default]
+    Toile,
+}
+
+impl Profile {
+    /// Its name in a manifest.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Kim2013 => kim2013::PROFILE,
+            Self::Toile => toile::PROFILE,
+        }
+    }
+}
 
 /// Policy of the encoder.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EncodeSettings {
-    /// Columns of the basis frozen at the first version, at most.
+    /// How coefficients become bytes.
+    pub profile: Profile,
+    /// What profile `toile` keeps to.
+    pub bound: Bound,
+    /// States that a basis is made for, at least: profile `toile` weighs the bytes of its basis
+    /// against those of so many states.
+    pub states_expected: u64,
+    /// Columns of the basis of a first version, at most.
     pub rank_max: usize,
     /// Columns that one later generation appends, at most: 32 of 8 bits cost a client about half
     /// a megabyte per 5,000 vertices.
@@ -25,22 +55,37 @@ pub struct EncodeSettings {
     /// Full scale of a coefficient over the largest one seen when its column was made.
     pub headroom: f32,
     /// A region is said to fall outside once its error is this many times that of the first
-    /// version.
+    /// version (`kim2013`: its largest; `toile`: its root mean square).
     pub error_factor: f32,
-    /// ... and above this (m): below, no one sees it, and the first version may be tiny.
+    /// ... and, for `kim2013`, above this (m): below, no one sees it, and the first version may be
+    /// tiny.
     pub error_floor_m: f32,
 }
 
 impl EncodeSettings {
-    /// The defaults for a basis of `rank_max` columns.
+    /// The defaults of profile `kim2013` for a basis of `rank_max` columns.
     pub fn for_rank(rank_max: usize) -> Self {
         Self {
+            profile: Profile::Kim2013,
+            bound: Bound::default(),
+            states_expected: 0,
             rank_max,
             generation_columns_max: 32,
             columns_max: (2 * rank_max).min(codec::COLUMNS_MAX),
             headroom: 1.5,
             error_factor: 1.5,
             error_floor_m: 0.002,
+        }
+    }
+
+    /// The defaults of profile `toile` for a bound.
+    pub fn for_bound(bound: Bound) -> Self {
+        Self {
+            profile: Profile::Toile,
+            bound,
+            states_expected: 20_000,
+            columns_max: 512,
+            ..Self::for_rank(400)
         }
     }
 }
@@ -58,11 +103,17 @@ pub enum EncodeError {
         /// Which one.
         column: usize,
         /// Why.
-        source: QuantiseError,
+        source: kim2013::QuantiseError,
     },
     /// Columns that do not make a generation.
     #[error(transparent)]
-    Generation(#[from] GenerationError),
+    Generation(#[from] kim2013::GenerationError),
+    /// Columns that do not make a generation of profile `toile`.
+    #[error(transparent)]
+    ToileGeneration(#[from] toile::GenerationError),
+    /// Coefficients or fixes that do not make a region of profile `toile`.
+    #[error(transparent)]
+    ToileRegion(#[from] toile::RegionError),
     /// A generation that does not extend the basis.
     #[error(transparent)]
     Append(#[from] AppendError),
@@ -72,6 +123,17 @@ pub enum EncodeError {
     /// States without extent: every vertex is at the hips.
     #[error("the states span nothing that a step of 300 micrometres can hold")]
     Nothing,
+    /// A bound that cannot be kept.
+    #[error("a bound of {0:?} cannot be kept: give lengths of 0.01 mm and more")]
+    Bound(Bound),
+    /// A root mean square that fixes did not reach.
+    #[error("the states were brought to {reached_m} m in the root mean square, not to {asked_m} m")]
+    Unreached {
+        /// Reached (m).
+        reached_m: f64,
+        /// Asked for (m).
+        asked_m: f64,
+    },
     /// Not whole states of the basis' rows, none, or more than a region holds.
     #[error(
         "{numbers} numbers do not make 1 to {} states of {rows} rows",
@@ -91,7 +153,7 @@ pub enum EncodeError {
 /// A region in bytes, and how far off it is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EncodedRegion {
-    /// `kim2013` region.
+    /// A region of the encoder's profile.
     pub bytes: Vec<u8>,
     /// Largest vertex error of its states, decoded as a client decodes them (m); rounded up.
     pub max_error_m: f32,
@@ -99,14 +161,39 @@ pub struct EncodedRegion {
     pub square_sum_m2: f64,
     /// A coefficient was beyond its column's headroom and was held there.
     pub overflowed: bool,
+    /// Vertices with a fix of their own, over all its states.
+    pub fixes: usize,
 }
 
 /// Columns of all generations, as the encoder needs them. Made from encoded generations only, so
 /// that a publisher that was resumed encodes as one that never stopped. Clones share them.
 #[derive(Clone)]
 pub struct Encoder {
-    basis: Basis,
+    pub(super) basis: Basis,
     layers: Vec<Arc<Layer>>,
+    pub(super) coding: Coding,
+}
+
+/// What a profile keeps beside the columns.
+#[derive(Clone)]
+pub(super) enum Coding {
+    Kim2013,
+    Toile(Box<Bounded>),
+}
+
+/// What profile `toile` keeps beside the columns.
+#[derive(Clone)]
+pub(super) struct Bounded {
+    pub(super) model: Model,
+    pub(super) tree: Option<Arc<Tree>>,
+    /// Code of the step of coefficients, from the newest generation.
+    pub(super) step: u8,
+    /// States that the first generation was made from, and its root mean square error (m).
+    pub(super) made: (u32, f32),
+    /// How many generations are of that moment.
+    pub(super) first_generations: usize,
+    pub(super) generations: usize,
+    pub(super) max_m: Option<f32>,
 }
 
 /// One generation: `C' -> metres`, and the factor of its normal equations.
@@ -115,15 +202,27 @@ struct Layer {
     normal: Llt<f64>,
 }
 
-/// Shows every state to a visitor, in order; called twice.
+/// Shows regions of states to a visitor, in order: state after state. Called several times.
 pub type Visit<'a> =
     dyn FnMut(&mut dyn FnMut(&[f32]) -> Result<(), EncodeError>) -> Result<(), EncodeError> + 'a;
 
 impl Encoder {
     /// Without columns.
-    pub fn new() -> Self {
+    pub fn new(settings: &EncodeSettings) -> Self {
         stay_on_this_thread();
-        Self { basis: Basis::new(), layers: Vec::new() }
+        let coding = match settings.profile {
+            Profile::Kim2013 => Coding::Kim2013,
+            Profile::Toile => Coding::Toile(Box::new(Bounded {
+                model: Model::default(),
+                tree: None,
+                step: 0,
+                made: (0, 0.0),
+                first_generations: 0,
+                generations: 0,
+                max_m: settings.bound.max_m,
+            })),
+        };
+        Self { basis: Basis::new(), layers: Vec::new(), coding }
     }
 
     /// The basis as a client has it.
@@ -136,8 +235,116 @@ impl Encoder {
     /// # Errors
     /// Bytes that are no generation, or one that does not extend this basis.
     pub fn append(&mut self, generation: &[u8]) -> Result<(), EncodeError> {
-        let generation = Generation::parse(generation)?;
+        let resident = match &mut self.coding {
+            Coding::Kim2013 => None,
+            Coding::Toile(bounded) => Some(bounded.append(generation)?),
+        };
+        let generation = kim2013::Generation::parse(resident.as_deref().unwrap_or(generation))?;
         self.basis.append(&generation)?;
+        let layer = Layer::new(&generation).ok_or(EncodeError::Dependent(self.layers.len()))?;
+        self.layers.push(Arc::new(layer));
+        Ok(())
+    }
+
+    /// Encodes 1 to 32 states: least squares against the decoded columns of each generation in
+    /// turn, each taking what the ones before left.
+    ///
+    /// * `positions`: state after state, the basis' rows each (m).
+    ///
+    /// # Errors
+    /// Numbers that are not such states, or not finite.
+    pub fn region(&self, positions: &[f32]) -> Result<EncodedRegion, EncodeError> {
+        let rows = self.basis.rows();
+        let numbers = positions.len();
+        let states = numbers.checked_div(rows).unwrap_or(0);
+        let fits = (1..=codec::REGION_STATES_MAX).contains(&states) && states * rows == numbers;
+        if !fits {
+            return Err(EncodeError::States { numbers, rows });
+        }
+        if let Some(at) = positions.iter().position(|x| !x.is_finite()) {
+            return Err(BasisError::NotFinite { state: at / rows, row: at % rows }.into());
+        }
+        match &self.coding {
+            Coding::Kim2013 => Ok(fixed_bits::region(self, positions)),
+            Coding::Toile(bounded) => bounded::region(self, bounded, positions),
+        }
+    }
+
+    /// Positions (m) of all states of a region that this encoder made, as a client decodes them;
+    /// `out` is resized.
+    ///
+    /// # Panics
+    /// Bytes that this encoder did not make.
+    pub fn decode(&self, region: &[u8], out: &mut Vec<f32>) {
+        match &self.coding {
+            Coding::Kim2013 => fixed_bits::decode(self, region, out),
+            Coding::Toile(bounded) => bounded::decode(self, bounded, region, out),
+        }
+    }
+
+    /// As [`Encoder::decode`], without the vertices' own fixes: what more columns could better.
+    ///
+    /// # Panics
+    /// Bytes that this encoder did not make.
+    pub(super) fn decode_columns(&self, region: &[u8], out: &mut Vec<f32>) {
+        match &self.coding {
+            Coding::Kim2013 => fixed_bits::decode(self, region, out),
+            Coding::Toile(bounded) => {
+                bounded::decode_columns(self, bounded, region, out);
+            }
+        }
+    }
+
+    /// Positions (m) from coefficients in 16-bit steps of full scale, state after state; `out` is
+    /// resized.
+    pub(super) fn reconstruct(&self, coefficients: &[i16], out: &mut Vec<f32>) {
+        let (rows, columns) = (self.basis.rows(), self.basis.columns());
+        out.resize(coefficients.len() / columns * rows, 0.0);
+        let mut scaled = vec![0.0f32; columns];
+        for (state, out) in coefficients.chunks_exact(columns).zip(out.chunks_exact_mut(rows)) {
+            let scale = |(out, c): (&mut f32, &i16)| *out = f32::from(*c) * (1.0 / FULL_SCALE);
+            scaled.iter_mut().zip(state).for_each(scale);
+            let whole = self.basis.reconstruct(&scaled, 0..rows, columns, out);
+            whole.expect("lengths are those of the basis");
+        }
+    }
+
+    /// Fits states to the columns. `round` gets column, state and the coefficient in fractions of
+    /// full scale (held within -1..=1), and returns it as the client will have it; says whether
+    /// one had to be held.
+    pub(super) fn fit(
+        &self,
+        positions: &[f32],
+        mut round: impl FnMut(usize, usize, f64) -> f64,
+    ) -> bool {
+        let rows = self.basis.rows();
+        let states = positions.len() / rows;
+        let mut rest = Mat::from_fn(rows, states, |row, s| f64::from(positions[s * rows + row]));
+        let mut overflowed = false;
+        let mut first = 0;
+        for (index, layer) in self.layers.iter().enumerate() {
+            let mut coefficients = layer.columns.transpose() * &rest;
+            layer.normal.solve_in_place(coefficients.as_mut());
+            for state in 0..states {
+                let column = coefficients.col_as_slice_mut(state);
+                for (c, value) in column.iter_mut().enumerate() {
+                    let held = value.clamp(-1.0, 1.0);
+                    overflowed |= held.to_bits() != value.to_bits();
+                    *value = round(first + c, state, held);
+                }
+            }
+            if index + 1 < self.layers.len() {
+                rest -= &layer.columns * &coefficients;
+            }
+            first += layer.columns.ncols();
+        }
+        overflowed
+    }
+}
+
+impl Layer {
+    /// `None` where the columns depend on one another.
+    fn new(generation: &kim2013::Generation<'_>) -> Option<Self> {
         let mut columns = Mat::zeros(generation.rows(), generation.columns());
         let step = f64::from(generation.step_m());
         for (c, (width, bytes)) in generation.entries().enumerate() {
@@ -151,290 +358,29 @@ impl Encoder {
         }
         let mut gram = columns.transpose() * &columns;
         for c in 0..gram.ncols() {
-            gram[(c, c)] *= 1.0 + 1e-9; // quantised columns may all but depend on one another
+            // Quantised columns may all but depend on one another, or be nothing at all.
+            let square = gram[(c, c)];
+            gram[(c, c)] = if square > 0.0 { square * (1.0 + 1e-9) } else { 1.0 };
         }
-        let normal =
-            gram.llt(Side::Lower).map_err(|_| EncodeError::Dependent(self.layers.len()))?;
-        self.layers.push(Arc::new(Layer { columns, normal }));
-        Ok(())
-    }
-
-    /// Encodes 1 to 32 states: least squares against the decoded columns of each generation in
-    /// turn, each taking what the ones before left.
-    ///
-    /// * `positions`: state after state, the basis' rows each (m).
-    ///
-    /// # Errors
-    /// Numbers that are not such states, or not finite.
-    pub fn region(&self, positions: &[f32]) -> Result<EncodedRegion, EncodeError> {
-        let (rows, columns) = (self.basis.rows(), self.basis.columns());
-        let numbers = positions.len();
-        let states = numbers.checked_div(rows).unwrap_or(0);
-        let fits = (1..=codec::REGION_STATES_MAX).contains(&states) && states * rows == numbers;
-        if !fits {
-            return Err(EncodeError::States { numbers, rows });
-        }
-        if let Some(at) = positions.iter().position(|x| !x.is_finite()) {
-            return Err(BasisError::NotFinite { state: at / rows, row: at % rows }.into());
-        }
-        let mut steps = vec![0i16; states * columns];
-        let overflowed = self.fit(positions, &mut steps);
-        let mut bytes = Vec::new();
-        kim2013::encode_region(columns, &steps, &mut bytes).expect("the shape was just checked");
-        let mut decoded = Vec::new();
-        self.decode(&bytes, &mut decoded);
-        let mut max = 0.0f64;
-        let mut square_sum_m2 = 0.0;
-        for (exact, decoded) in positions.chunks_exact(3).zip(decoded.chunks_exact(3)) {
-            let square: f64 =
-                (0..3).map(|i| (f64::from(exact[i]) - f64::from(decoded[i])).powi(2)).sum();
-            square_sum_m2 += square;
-            max = max.max(square);
-        }
-        Ok(EncodedRegion { bytes, max_error_m: round_up(max.sqrt()), square_sum_m2, overflowed })
-    }
-
-    /// Positions (m) of all states of a region that this encoder made, as a client decodes them;
-    /// `out` is resized.
-    ///
-    /// # Panics
-    /// Bytes that this encoder did not make.
-    pub fn decode(&self, region: &[u8], out: &mut Vec<f32>) {
-        let (rows, columns) = (self.basis.rows(), self.basis.columns());
-        let region = Region::parse(region).expect("a region of this encoder");
-        let mut coefficients = vec![0.0; columns];
-        out.resize(region.states() * rows, 0.0);
-        for (state, out) in out.chunks_exact_mut(rows).enumerate() {
-            region.state(state, &mut coefficients);
-            self.basis
-                .reconstruct(&coefficients, 0..rows, columns, out)
-                .expect("lengths are those of the basis");
-        }
-    }
-
-    /// Rounded coefficients of each state into `steps`; whether one was beyond its headroom.
-    fn fit(&self, positions: &[f32], steps: &mut [i16]) -> bool {
-        let (rows, columns) = (self.basis.rows(), self.basis.columns());
-        let states = positions.len() / rows;
-        let mut rest = Mat::from_fn(rows, states, |row, s| f64::from(positions[s * rows + row]));
-        let mut overflowed = false;
-        let mut first = 0;
-        for layer in &self.layers {
-            let mut coefficients = layer.columns.transpose() * &rest;
-            layer.normal.solve_in_place(coefficients.as_mut());
-            for state in 0..states {
-                let out = &mut steps[state * columns + first..];
-                for (c, out) in coefficients.col_as_slice_mut(state).iter_mut().zip(out) {
-                    let held = c.clamp(-1.0, 1.0);
-                    overflowed |= held.to_bits() != c.to_bits();
-                    *out = kim2013::quantise_coefficient(held as f32).unwrap_or(0);
-                    *c = f64::from(*out) / f64::from(FULL_SCALE);
-                }
-            }
-            rest -= &layer.columns * &coefficients;
-            first += layer.columns.ncols();
-        }
-        overflowed
+        let normal = gram.llt(Side::Lower).ok()?;
+        Some(Self { columns, normal })
     }
 }
 
-impl Default for Encoder {
-    fn default() -> Self {
-        Self::new()
+/// Largest vertex error (m, rounded up) and the sum of their squares (m^2).
+pub(super) fn errors(exact: &[f32], decoded: &[f32]) -> (f32, f64) {
+    let (mut max, mut sum) = (0.0f64, 0.0);
+    for (exact, decoded) in exact.chunks_exact(3).zip(decoded.chunks_exact(3)) {
+        let square: f64 =
+            (0..3).map(|i| (f64::from(exact[i]) - f64::from(decoded[i])).powi(2)).sum();
+        sum += square;
+        max = max.max(square);
     }
-}
-
-/// A generation in bytes that spans the states shown by `visit`: at most `columns_max` columns,
-/// those alone that move some vertex by a step or more. `None` when none does.
-///
-/// # Errors
-/// No basis, or a column that does not fit its bits; whatever `visit` returns.
-pub fn generation(
-    rows: usize,
-    columns_max: usize,
-    headroom: f32,
-    visit: &mut Visit<'_>,
-) -> Result<Option<Vec<u8>>, EncodeError> {
-    let mut svd = StreamingSvd::new(rows, columns_max);
-    visit(&mut |state| Ok(svd.push(state)?))?;
-    let Columns { columns, .. } = svd.finish()?;
-    let mut maxima = Maxima::new(&columns);
-    visit(&mut |state| {
-        maxima.push(state);
-        Ok(())
-    })?;
-    let mut scales = Vec::new();
-    let mut entries = Vec::new();
-    let mut rescaled = vec![0.0f32; rows];
-    for (column, maximum) in maxima.finish().into_iter().enumerate() {
-        let scale = (maximum * f64::from(headroom)) as f32;
-        let source = columns.col_as_slice(column);
-        rescaled.iter_mut().zip(source).for_each(|(out, b)| *out = (b * f64::from(scale)) as f32);
-        if rescaled.iter().all(|b| b.abs() < kim2013::STEP_M) {
-            continue;
-        }
-        let at = entries.len();
-        entries.resize(at + rows, 0);
-        kim2013::quantise_column(&rescaled, kim2013::STEP_M, &mut entries[at..])
-            .map_err(|source| EncodeError::Column { column, source })?;
-        scales.push(scale);
-    }
-    if scales.is_empty() {
-        return Ok(None);
-    }
-    let mut bytes = Vec::new();
-    kim2013::encode_generation(rows as u32, kim2013::STEP_M, &scales, &entries, &mut bytes)?;
-    Ok(Some(bytes))
-}
-
-/// Largest absolute coefficient of each orthonormal column over the states shown.
-struct Maxima<'a> {
-    columns: &'a Mat<f64>,
-    block: Mat<f64>,
-    filled: usize,
-    maxima: Vec<f64>,
-}
-
-impl<'a> Maxima<'a> {
-    fn new(columns: &'a Mat<f64>) -> Self {
-        let block = Mat::zeros(columns.nrows(), codec::REGION_STATES_MAX);
-        Self { columns, block, filled: 0, maxima: vec![0.0; columns.ncols()] }
-    }
-
-    fn push(&mut self, state: &[f32]) {
-        let column = self.block.col_as_slice_mut(self.filled);
-        column.iter_mut().zip(state).for_each(|(out, x)| *out = f64::from(*x));
-        self.filled += 1;
-        if self.filled == self.block.ncols() {
-            self.absorb();
-        }
-    }
-
-    fn absorb(&mut self) {
-        let coefficients = self.columns.transpose() * self.block.as_ref().subcols(0, self.filled);
-        for state in 0..self.filled {
-            let state = coefficients.col_as_slice(state);
-            self.maxima.iter_mut().zip(state).for_each(|(max, c)| *max = max.max(c.abs()));
-        }
-        self.filled = 0;
-    }
-
-    fn finish(mut self) -> Vec<f64> {
-        self.absorb();
-        self.maxima
-    }
+    (round_up(max.sqrt()), sum)
 }
 
 /// The smallest f32 that is not below `x`.
-fn round_up(x: f64) -> f32 {
+pub(super) fn round_up(x: f64) -> f32 {
     let nearest = x as f32;
     if f64::from(nearest) < x { nearest.next_up() } else { nearest }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    const ROWS: usize = 300;
-
-    /// Smooth states over six shapes; `odd` adds a seventh.
-    fn state(t: usize, odd: f32) -> Vec<f32> {
-        let t = t as f32 * 0.1;
-        let row = |row: usize| {
-            let x = row as f32 / ROWS as f32;
-            let shapes = (1..6).map(|k| {
-                let k = k as f32;
-                (k * t).sin() * (9.0 * k * x + k).sin() * 0.2 / (k * k)
-            });
-            0.4 * (7.0 * x).cos() + shapes.sum::<f32>() + odd * (40.0 * x * x).sin()
-        };
-        (0..ROWS).map(row).collect()
-    }
-
-    fn encoder(rank: usize) -> Encoder {
-        let mut visit = |show: &mut dyn FnMut(&[f32]) -> Result<(), EncodeError>| {
-            (0..200).try_for_each(|t| show(&state(t, 0.0)))
-        };
-        let bytes = generation(ROWS, rank, 1.5, &mut visit).unwrap().unwrap();
-        let mut encoder = Encoder::new();
-        encoder.append(&bytes).unwrap();
-        encoder
-    }
-
-    fn region(from: usize, odd: f32) -> Vec<f32> {
-        (from..from + 20).flat_map(|t| state(t, odd)).collect()
-    }
-
-    #[test]
-    fn enough_columns_come_within_two_quanta() {
-        let encoder = encoder(20);
-        assert_eq!(encoder.basis().columns(), 6);
-        let encoded = encoder.region(&region(50, 0.0)).unwrap();
-        assert!(encoded.max_error_m < 5e-4, "{}", encoded.max_error_m);
-        assert!(!encoded.overflowed);
-    }
-
-    #[test]
-    fn the_error_is_the_largest_of_all_vertices_and_states() {
-        let encoder = encoder(3);
-        let states = region(50, 0.0);
-        let encoded = encoder.region(&states).unwrap();
-        let mut decoded = Vec::new();
-        encoder.decode(&encoded.bytes, &mut decoded);
-        let errors: Vec<f64> = states
-            .chunks(3)
-            .zip(decoded.chunks(3))
-            .map(|(a, b)| (0..3).map(|i| f64::from(a[i] - b[i]).powi(2)).sum::<f64>().sqrt())
-            .collect();
-        let max = errors.iter().copied().fold(0.0, f64::max);
-        assert!((f64::from(encoded.max_error_m) - max).abs() < 1e-7);
-        let squares: f64 = errors.iter().map(|e| e * e).sum();
-        assert!((encoded.square_sum_m2 - squares).abs() < 1e-6);
-        assert!(max > 0.005, "three columns cannot do");
-    }
-
-    #[test]
-    fn what_falls_outside_fits_an_appended_generation_and_old_bytes_stay() {
-        let mut encoder = encoder(20);
-        let old = encoder.region(&region(0, 0.0)).unwrap();
-        let states = region(70, 0.1);
-        let before = encoder.region(&states).unwrap();
-        assert!(before.max_error_m > 0.05, "{}", before.max_error_m);
-        let mut decoded = Vec::new();
-        encoder.decode(&before.bytes, &mut decoded);
-        let rest: Vec<f32> = states.iter().zip(&decoded).map(|(a, b)| a - b).collect();
-        let mut visit = |show: &mut dyn FnMut(&[f32]) -> Result<(), EncodeError>| {
-            rest.chunks(ROWS).try_for_each(show)
-        };
-        let bytes = generation(ROWS, 8, 1.5, &mut visit).unwrap().unwrap();
-        encoder.append(&bytes).unwrap();
-        let after = encoder.region(&states).unwrap();
-        assert!(after.max_error_m < 5e-4, "{}", after.max_error_m);
-        let mut same = vec![0.0; encoder.basis().columns()];
-        Region::parse(&old.bytes).unwrap().state(3, &mut same);
-        let mut out = vec![0.0; ROWS];
-        encoder.basis().reconstruct(&same, 0..ROWS, same.len(), &mut out).unwrap();
-        let exact = state(3, 0.0);
-        assert!(out.iter().zip(&exact).all(|(a, b)| (a - b).abs() <= old.max_error_m));
-    }
-
-    #[test]
-    fn a_coefficient_beyond_its_headroom_is_held_and_reported() {
-        let encoder = encoder(20);
-        let far: Vec<f32> = state(3, 0.0).iter().map(|x| 4.0 * x).collect();
-        let encoded = encoder.region(&far).unwrap();
-        assert!(encoded.overflowed && encoded.max_error_m > 0.1);
-    }
-
-    #[test]
-    fn what_is_no_state_is_refused() {
-        let encoder = encoder(4);
-        assert!(matches!(encoder.region(&[]), Err(EncodeError::States { .. })));
-        assert!(matches!(encoder.region(&[0.0; ROWS + 1]), Err(EncodeError::States { .. })));
-        let many = vec![0.0; 33 * ROWS];
-        assert!(matches!(encoder.region(&many), Err(EncodeError::States { .. })));
-        let mut nan = state(0, 0.0);
-        nan[7] = f32::NAN;
-        assert!(matches!(encoder.region(&nan), Err(EncodeError::Basis(_))));
-    }
 }

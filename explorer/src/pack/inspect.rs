@@ -7,8 +7,7 @@ use protocol::region::{RegionChunk, RegionEntry};
 use protocol::scene::{GarmentChunk, SceneChunk};
 use protocol::{ChunkHash, DecodeError, LinkTable, NotTotal, PublisherKey, StateId, VersionNumber};
 
-use codec::Basis;
-use codec::kim2013::{Generation, GenerationError, PROFILE, Region, RegionError};
+use codec::{Decoder, DecoderError};
 
 use super::store::{self, StoreError};
 
@@ -81,7 +80,7 @@ pub enum InspectError {
         source: ChunkError,
     },
     /// A codec that this build does not have.
-    #[error("garment {garment:?} is in codec {codec:?}; this build reads {PROFILE:?}")]
+    #[error("garment {garment:?} is in codec {codec:?}; this build reads {:?}", Decoder::PROFILES)]
     Codec {
         /// Name of the garment.
         garment: String,
@@ -117,17 +116,14 @@ pub enum ChunkError {
     Decode(#[from] DecodeError),
     /// A basis generation.
     #[error(transparent)]
-    Generation(#[from] GenerationError),
-    /// A generation that does not extend the ones before.
-    #[error(transparent)]
-    Append(#[from] codec::AppendError),
+    Generation(#[from] DecoderError),
     /// A region's bytes.
     #[error("region of state {state}: {source}")]
     Region {
         /// Its first state.
         state: StateId,
         /// What is wrong.
-        source: RegionError,
+        source: DecoderError,
     },
     /// Something that does not match what lists it.
     #[error("{what} is {found}, but {expected} is promised")]
@@ -166,16 +162,17 @@ async fn inspect_garment(
     from: &dyn ObjectStore,
     garment: &GarmentVersion,
 ) -> Result<GarmentInspection, InspectError> {
-    if garment.codec != PROFILE {
+    let Some(decoder) = Decoder::new(&garment.codec) else {
         let (garment, codec) = (garment.name.clone(), garment.codec.clone());
         return Err(InspectError::Codec { garment, codec });
-    }
+    };
     let bytes = store::chunk(from, &garment.scene).await?;
     let scene = SceneChunk::decode(&bytes).map_err(|e| wrong(garment.scene.hash, e))?;
     let bytes = store::chunk(from, &garment.mesh).await?;
     let mesh = GarmentChunk::decode(&bytes).map_err(|e| wrong(garment.mesh.hash, e))?;
-    let (basis, ends) = read_basis(from, garment, 3 * mesh.vertex_count as usize).await?;
-    let regions = read_regions(from, garment, &ends).await?;
+    let rows = 3 * mesh.vertex_count as usize;
+    let (decoder, ends) = read_basis(from, garment, decoder, rows).await?;
+    let regions = read_regions(from, garment, &decoder, &ends).await?;
     let found_m = regions.iter().map(|region| region.max_error_m).fold(0.0, f32::max);
     let stated_m = garment.stats.codec_max_error_m;
     if found_m > stated_m {
@@ -199,7 +196,7 @@ async fn inspect_garment(
         worst_error_mm: 1e3 * garment.stats.worst_error_m,
         total: table.is_ok(),
         not_total: table.err(),
-        rank: basis.columns(),
+        rank: decoder.basis().columns(),
         generations: ends.len(),
         codec_max_error_mm: 1e3 * found_m,
         codec_rms_error_mm: 1e3 * garment.stats.codec_rms_error_m,
@@ -215,25 +212,27 @@ async fn inspect_garment(
 async fn read_basis(
     from: &dyn ObjectStore,
     garment: &GarmentVersion,
+    mut decoder: Decoder,
     rows: usize,
-) -> Result<(Basis, Vec<usize>), InspectError> {
-    let mut basis = Basis::new();
+) -> Result<(Decoder, Vec<usize>), InspectError> {
     let mut ends = Vec::new();
     for listed in &garment.generations {
         let hash = listed.chunk.hash;
         let bytes = store::chunk(from, &listed.chunk).await?;
-        let generation = Generation::parse(&bytes).map_err(|e| wrong(hash, e))?;
-        same(hash, "rows", generation.rows() as u64, rows as u64)?;
-        same(hash, "columns", generation.columns() as u64, u64::from(listed.columns))?;
-        basis.append(&generation).map_err(|e| wrong(hash, e))?;
-        ends.push(basis.columns());
+        let before = decoder.basis().columns();
+        decoder.append(&bytes).map_err(|e| wrong(hash, e))?;
+        let columns = decoder.basis().columns();
+        same(hash, "rows", decoder.basis().rows() as u64, rows as u64)?;
+        same(hash, "columns", (columns - before) as u64, u64::from(listed.columns))?;
+        ends.push(columns);
     }
-    Ok((basis, ends))
+    Ok((decoder, ends))
 }
 
 async fn read_regions(
     from: &dyn ObjectStore,
     garment: &GarmentVersion,
+    decoder: &Decoder,
     ends: &[usize],
 ) -> Result<Vec<RegionEntry>, InspectError> {
     let mut regions = Vec::new();
@@ -247,12 +246,13 @@ async fn read_regions(
         same(hash, "state count", states, u64::from(listed.state_count))?;
         for entry in &chunk.regions {
             let state = entry.first_state;
-            let region = Region::parse(&entry.bytes)
+            let region = decoder
+                .region(&entry.bytes)
                 .map_err(|source| wrong(hash, ChunkError::Region { state, source }))?;
-            let states = region.states() as u64;
+            let states = region.states as u64;
             same(hash, "states of a region", states, u64::from(entry.state_count))?;
             let columns = ends.get(entry.generation.index()).copied().unwrap_or(0);
-            same(hash, "columns of a region", region.columns() as u64, columns as u64)?;
+            same(hash, "columns of a region", region.columns as u64, columns as u64)?;
         }
         regions.extend(chunk.regions);
     }

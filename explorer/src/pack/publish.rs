@@ -18,7 +18,7 @@ use protocol::{
     VersionNumber,
 };
 
-use super::encode::{EncodeError, EncodeSettings, Encoder};
+use super::encode::{Coding, EncodeError, EncodeSettings, Encoder, Profile};
 use super::regions::{self, Cut, Encoding, NewRegions, RunsError};
 use super::scene_chunk::{garment_chunk, scene_chunk};
 use super::store::{self, NewChunks, StoreError};
@@ -116,6 +116,7 @@ struct New {
     chunks: NewChunks,
     encoder: Encoder,
     encoded_states: u64,
+    rebased: bool,
 }
 
 /// What publishing did.
@@ -133,6 +134,8 @@ pub struct Published {
     pub new_bytes: u64,
     /// States encoded.
     pub encoded_states: u64,
+    /// Whether this version stands on a new basis: every state was encoded again.
+    pub rebased: bool,
 }
 
 impl Publisher {
@@ -149,7 +152,7 @@ impl Publisher {
     ) -> Result<Self, PublishError> {
         let scene = Fixed::new(scene)?;
         claim(&*store, &key).await?;
-        let encoder = Encoder::new();
+        let encoder = Encoder::new(&settings);
         let mut publisher =
             Self { store, key, settings, scene, head: None, encoder, first_error_m: None };
         if let Some(number) = store::head_number(&*publisher.store).await? {
@@ -186,18 +189,21 @@ impl Publisher {
         let links = view.links();
         let pages = self.total(&links)?;
         let before = self.garment();
-        let covered = before.map_or(0, covered);
-        let cuts = regions::cut(view.runs(), covered, links.len() as u64)?;
+        let states = links.len() as u64;
+        let rebased = self.pays_to_rebase(states);
+        let kept = before.filter(|_| !rebased);
+        let cuts = regions::cut(view.runs(), kept.map_or(0, covered), states)?;
         let encoding = Encoding {
             view,
             settings: &self.settings,
-            generations: before.map_or(0, |garment| garment.generations.len()),
+            generations: kept.map_or(0, |garment| garment.generations.len()),
             outside_m: self.outside_m(),
         };
-        let new = encoding.encode(&self.encoder, &cuts)?;
+        let fresh = rebased.then(|| Encoder::new(&self.settings));
+        let new = encoding.encode(fresh.as_ref().unwrap_or(&self.encoder), &cuts)?;
         let mut chunks = NewChunks::default();
         let encoder = new.encoder.clone();
-        let garment = self.version(view.stats(), &cuts, new, &pages, &mut chunks);
+        let garment = self.version(kept, (view.stats(), &cuts, new), &pages, &mut chunks);
         if let Some(head) = self.head.as_ref().filter(|_| before == Some(&garment)) {
             return Ok(Prepared { manifest: head.clone(), new: None });
         }
@@ -208,7 +214,7 @@ impl Publisher {
             listed.flat_map(|garment| garment.chunks()).map(|chunk| chunk.hash).collect();
         chunks.chunks.retain(|hash, _| !listed.contains(hash));
         let encoded_states = cuts.iter().map(|cut| u64::from(cut.count)).sum();
-        Ok(Prepared { manifest, new: Some(New { chunks, encoder, encoded_states }) })
+        Ok(Prepared { manifest, new: Some(New { chunks, encoder, encoded_states, rebased }) })
     }
 
     /// Makes a prepared version visible: chunks first, then its manifest in one atomic step.
@@ -218,16 +224,15 @@ impl Publisher {
     pub async fn commit(&mut self, prepared: Prepared) -> Result<Published, PublishError> {
         let Prepared { manifest, new } = prepared;
         let number = manifest.number;
-        let Some(New { chunks, encoder, encoded_states }) = new else {
-            let (new_chunks, new_bytes, encoded_states) = (0, 0, 0);
-            let created = false;
+        let Some(New { chunks, encoder, encoded_states, rebased }) = new else {
             return Ok(Published {
                 number,
                 manifest,
-                created,
-                new_chunks,
-                new_bytes,
-                encoded_states,
+                created: false,
+                new_chunks: 0,
+                new_bytes: 0,
+                encoded_states: 0,
+                rebased: false,
             });
         };
         if self.next_number() != number {
@@ -250,7 +255,15 @@ impl Publisher {
         let first = manifest.garment(&self.scene.name).map(|g| g.stats.codec_max_error_m);
         self.first_error_m = self.first_error_m.or(first);
         self.head = Some(manifest.clone());
-        Ok(Published { number, manifest, created: true, new_chunks, new_bytes, encoded_states })
+        Ok(Published {
+            number,
+            manifest,
+            created: true,
+            new_chunks,
+            new_bytes,
+            encoded_states,
+            rebased,
+        })
     }
 
     fn garment(&self) -> Option<&GarmentVersion> {
@@ -269,6 +282,19 @@ impl Publisher {
         })
     }
 
+    /// Whether a new basis pays, though every state is sent again on it: the states have doubled
+    /// since the basis was made, and they have outgrown it. Doubling bounds the price: all bases
+    /// together cost no more than twice the last one.
+    fn pays_to_rebase(&self, states: u64) -> bool {
+        let (Coding::Toile(bounded), Some(garment)) = (&self.encoder.coding, self.garment()) else {
+            return false;
+        };
+        let (made_states, rms_m) = bounded.made;
+        let outgrown = garment.generations.len() > bounded.first_generations
+            || garment.stats.codec_rms_error_m > 1.1 * rms_m;
+        states >= 2 * u64::from(made_states).max(1) && outgrown
+    }
+
     /// The link pages, proved total.
     fn total(&self, links: &[LinkEntry]) -> Result<Vec<LinkPage>, PublishError> {
         let pages = LinkPage::split(links);
@@ -280,24 +306,22 @@ impl Publisher {
     /// The garment's part of the next manifest; its chunks go to `chunks`.
     fn version(
         &self,
-        stats: VersionStats,
-        cuts: &[Cut],
-        new: NewRegions,
+        before: Option<&GarmentVersion>,
+        (stats, cuts, new): (VersionStats, &[Cut], NewRegions),
         pages: &[LinkPage],
         chunks: &mut NewChunks,
     ) -> GarmentVersion {
-        let before = self.garment();
-        let stats = self.with_codec_figures(stats, cuts, &new);
+        let stats = self.with_codec_figures(before, stats, cuts, &new);
         let mut generations = before.map_or(Vec::new(), |garment| garment.generations.clone());
-        if let Some((bytes, columns)) = new.generation {
+        for (bytes, columns) in new.generations {
             generations.push(GenerationRef { chunk: chunks.add(bytes), columns });
         }
         let mut covered = before.map_or(Vec::new(), |garment| garment.regions.clone());
         covered.extend(regions::bundle(cuts, new.regions, chunks));
         GarmentVersion {
-            id: before.map_or_else(|| self.free_id(), |garment| garment.id),
+            id: self.garment().map_or_else(|| self.free_id(), |garment| garment.id),
             name: self.scene.name.clone(),
-            codec: codec::kim2013::PROFILE.into(),
+            codec: self.settings.profile.name().into(),
             scene: chunks.add(self.scene.scene.clone()),
             mesh: chunks.add(self.scene.mesh.clone()),
             generations,
@@ -311,12 +335,13 @@ impl Publisher {
     /// publisher writes what an uninterrupted one writes.
     fn with_codec_figures(
         &self,
+        before: Option<&GarmentVersion>,
         stats: VersionStats,
         cuts: &[Cut],
         new: &NewRegions,
     ) -> VersionStats {
-        let before = self.garment().map_or_else(VersionStats::default, |garment| garment.stats);
-        let old_states = self.garment().map_or(0, covered);
+        let old_states = before.map_or(0, covered);
+        let before = before.map_or_else(VersionStats::default, |garment| garment.stats);
         let vertices = self.scene.vertex_count as f64;
         let new_states: u64 = cuts.iter().map(|cut| u64::from(cut.count)).sum();
         let old_squares =
@@ -351,7 +376,7 @@ impl Publisher {
         let publisher = self.key.public();
         let head = store::version(&*self.store, number, &publisher).await?.manifest;
         if let Some(garment) = head.garment(&self.scene.name) {
-            self.scene.check_same(garment)?;
+            self.scene.check_same(garment, self.settings.profile)?;
             for generation in &garment.generations {
                 let bytes = store::chunk(&*self.store, &generation.chunk).await?;
                 self.encoder.append(&bytes)?;
@@ -393,13 +418,13 @@ impl Fixed {
         })
     }
 
-    fn check_same(&self, garment: &GarmentVersion) -> Result<(), PublishError> {
+    fn check_same(&self, garment: &GarmentVersion, profile: Profile) -> Result<(), PublishError> {
         let same = |chunk: &ChunkRef, bytes: &[u8]| chunk.hash == ChunkHash::of(bytes);
         let what = if !same(&garment.scene, &self.scene) {
             "scene"
         } else if !same(&garment.mesh, &self.mesh) {
             "mesh"
-        } else if garment.codec != codec::kim2013::PROFILE {
+        } else if garment.codec != profile.name() {
             "codec"
         } else {
             return Ok(());

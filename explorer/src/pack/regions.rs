@@ -4,7 +4,8 @@ use protocol::manifest::RegionChunkRef;
 use protocol::region::{RegionChunk, RegionEntry};
 use protocol::{GenerationId, StateId, limits};
 
-use super::encode::{self, EncodeError, EncodeSettings, EncodedRegion, Encoder};
+use super::columns;
+use super::encode::{Coding, EncodeError, EncodeSettings, EncodedRegion, Encoder};
 use super::store::NewChunks;
 use crate::view::{GraphView, Run};
 
@@ -93,10 +94,10 @@ pub(super) fn cut(runs: &[Run], covered: u64, states: u64) -> Result<Vec<Cut>, R
 
 /// The newly encoded part of a version.
 pub(super) struct NewRegions {
-    /// The encoder, with the new generation if one was opened.
+    /// The encoder, with the new generations if some were opened.
     pub(super) encoder: Encoder,
-    /// Bytes and columns of the generation that was opened.
-    pub(super) generation: Option<(Vec<u8>, u16)>,
+    /// Bytes and columns of each generation that was opened.
+    pub(super) generations: Vec<(Vec<u8>, u16)>,
     /// One per cut, with its generation.
     pub(super) regions: Vec<(GenerationId, EncodedRegion)>,
 }
@@ -115,40 +116,66 @@ impl NewRegions {
 pub(super) struct Encoding<'a> {
     pub(super) view: &'a dyn GraphView,
     pub(super) settings: &'a EncodeSettings,
-    /// Generations published so far.
+    /// Generations published so far; 0 where the basis is to be made.
     pub(super) generations: usize,
-    /// A region falls outside from this error on (m); infinite for the first version.
+    /// A region of profile `kim2013` falls outside from this error on (m); infinite for the first
+    /// version.
     pub(super) outside_m: f32,
 }
 
+/// A basis from more states than this is made from every second, third, ... of their regions: what
+/// they leave out is much like what they hold, and every state is certified anyway.
+const BASIS_STATES_MAX: u64 = 8192;
+/// States outside of the basis before a generation is opened for them, in profile `toile`: fewer
+/// are not worth its bytes.
+const OUTSIDE_STATES_MIN: u32 = 64;
+
 impl Encoding<'_> {
-    /// Encodes the cuts. The first version freezes its basis over them; later ones open a
-    /// generation for those that fall outside, as long as there is room.
+    /// Encodes the cuts. The first version, and a new base, freezes its basis over them; later ones
+    /// open a generation for those that fall outside, as long as there is room.
     pub(super) fn encode(&self, known: &Encoder, cuts: &[Cut]) -> Result<NewRegions, EncodeError> {
-        let mut new = NewRegions { encoder: known.clone(), generation: None, regions: Vec::new() };
+        let (encoder, generations) = (known.clone(), Vec::new());
+        let mut new = NewRegions { encoder, generations, regions: Vec::new() };
         let mut positions = Vec::new();
         if self.generations == 0 && !cuts.is_empty() {
-            self.open(&mut new, self.settings.rank_max, &mut |show| {
-                cuts.iter().try_for_each(|cut| {
+            let states: u64 = cuts.iter().map(|cut| u64::from(cut.count)).sum();
+            let every = states.div_ceil(BASIS_STATES_MAX) as usize;
+            let mut visit = |show: &mut dyn FnMut(&[f32]) -> Result<(), EncodeError>| {
+                cuts.iter().step_by(every).try_for_each(|cut| {
                     self.read(cut, &mut positions)?;
-                    positions.chunks_exact(self.rows()).try_for_each(&mut *show)
+                    show(&positions)
                 })
-            })?;
+            };
+            let settings = self.settings;
+            for bytes in columns::first_generations(self.rows(), states, settings, &mut visit)? {
+                new.open(bytes)?;
+            }
         }
+        let generation = (self.generations + new.generations.len()).max(1) - 1;
         let mut outside = Vec::new();
         for (index, cut) in cuts.iter().enumerate() {
             self.read(cut, &mut positions)?;
             let region = new.encoder.region(&positions)?;
-            if region.overflowed || region.max_error_m > self.outside_m {
+            if self.is_outside(&new.encoder, cut, &region) {
                 outside.push(index);
             }
-            let generation = self.generations.max(1) - 1;
             new.regions.push((GenerationId(generation as u16), region));
         }
         if self.generations > 0 && !outside.is_empty() {
             self.extend(&mut new, cuts, &outside)?;
         }
         Ok(new)
+    }
+
+    fn is_outside(&self, encoder: &Encoder, cut: &Cut, region: &EncodedRegion) -> bool {
+        match &encoder.coding {
+            Coding::Kim2013 => region.overflowed || region.max_error_m > self.outside_m,
+            Coding::Toile(bounded) => {
+                let vertices = f64::from(cut.count) * self.view.vertex_count() as f64;
+                let rms_m = (region.square_sum_m2 / vertices).sqrt();
+                rms_m > f64::from(self.settings.error_factor * bounded.made.1)
+            }
+        }
     }
 
     /// Opens a generation from what the columns so far leave of the regions that fall outside, and
@@ -161,47 +188,38 @@ impl Encoding<'_> {
     ) -> Result<(), EncodeError> {
         let room = self.settings.columns_max.saturating_sub(new.encoder.basis().columns());
         let columns_max = room.min(self.settings.generation_columns_max);
+        let states: u32 = outside.iter().map(|i| cuts[*i].count).sum();
+        let bounded = match &new.encoder.coding {
+            Coding::Kim2013 => None,
+            Coding::Toile(_) if states < OUTSIDE_STATES_MIN => return Ok(()),
+            Coding::Toile(bounded) => Some(bounded.clone()),
+        };
         if columns_max == 0 || self.generations >= limits::GENERATIONS_MAX {
             return Ok(());
         }
-        let (rows, before) = (self.rows(), new.encoder.clone());
-        let coded: Vec<Vec<u8>> = outside.iter().map(|i| new.regions[*i].1.bytes.clone()).collect();
+        let before = new.encoder.clone();
         let (mut positions, mut decoded) = (Vec::new(), Vec::new());
-        self.open(new, columns_max, &mut |show| {
-            outside.iter().zip(&coded).try_for_each(|(index, bytes)| {
+        let mut visit = |show: &mut dyn FnMut(&[f32]) -> Result<(), EncodeError>| {
+            outside.iter().try_for_each(|index| {
                 self.read(&cuts[*index], &mut positions)?;
-                before.decode(bytes, &mut decoded);
+                before.decode_columns(&new.regions[*index].1.bytes, &mut decoded);
                 positions.iter_mut().zip(&decoded).for_each(|(p, d)| *p -= d);
-                positions.chunks_exact(rows).try_for_each(&mut *show)
+                show(&positions)
             })
-        })?;
-        if new.generation.is_none() {
-            return Ok(());
-        }
+        };
+        let known = bounded.as_ref().and_then(|bounded| {
+            let tree = bounded.tree.as_deref()?;
+            Some((tree, bounded.step, f64::from(bounded.made.1)))
+        });
+        let (rows, settings) = (self.rows(), self.settings);
+        let made = columns::appended_generation(rows, columns_max, settings, known, &mut visit)?;
+        let Some(bytes) = made else { return Ok(()) };
+        new.open(bytes)?;
         for index in outside {
             self.read(&cuts[*index], &mut positions)?;
             let region = new.encoder.region(&positions)?;
             new.regions[*index] = (GenerationId(self.generations as u16), region);
         }
-        Ok(())
-    }
-
-    fn open(
-        &self,
-        new: &mut NewRegions,
-        columns_max: usize,
-        visit: &mut encode::Visit<'_>,
-    ) -> Result<(), EncodeError> {
-        let headroom = self.settings.headroom;
-        let made = encode::generation(self.rows(), columns_max, headroom, visit)?;
-        let Some(bytes) = made else {
-            // Later, what is left may be too small to be worth a column. At first it may not.
-            return if self.generations == 0 { Err(EncodeError::Nothing) } else { Ok(()) };
-        };
-        let columns = new.encoder.basis().columns();
-        new.encoder.append(&bytes)?;
-        let appended = new.encoder.basis().columns() - columns;
-        new.generation = Some((bytes, appended as u16));
         Ok(())
     }
 
@@ -216,6 +234,16 @@ impl Encoding<'_> {
         for (state, out) in (cut.first.0..).zip(out.chunks_exact_mut(rows)) {
             self.view.positions(StateId(state), out)?;
         }
+        Ok(())
+    }
+}
+
+impl NewRegions {
+    fn open(&mut self, bytes: Vec<u8>) -> Result<(), EncodeError> {
+        let columns = self.encoder.basis().columns();
+        self.encoder.append(&bytes)?;
+        let appended = self.encoder.basis().columns() - columns;
+        self.generations.push((bytes, appended as u16));
         Ok(())
     }
 }
