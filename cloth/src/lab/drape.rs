@@ -20,6 +20,8 @@ const OUTER_M: f32 = 0.15;
 const INNER_M: f32 = 0.09;
 /// Cells of the shadow's grid (m).
 const CELL_M: f32 = 5e-4;
+/// What a drape coefficient is good for (points).
+const REPEATS: f64 = 3.0;
 
 fn drapes(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let vertices = stage.settings.vertices.unwrap_or(2000);
@@ -27,34 +29,41 @@ fn drapes(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let asked = stage.settings.fabric.copied();
     let mut fabrics: Vec<Fabric> = asked.map_or(FABRICS.to_vec(), |f| vec![f]);
     fabrics.sort_by(|a, b| stiffness(a).total_cmp(&stiffness(b)));
-    let mut found: Vec<f64> = Vec::new();
     let chosen = if stage.settings.quick { 4 } else { 1 };
-    for fabric in fabrics.iter().step_by(chosen) {
-        found.push(drape(stage, fabric, rings, 0.0)?);
+    let plain = Material::default();
+    for own in [true, false] {
+        let mut found: Vec<f64> = Vec::new();
+        for fabric in fabrics.iter().step_by(chosen) {
+            let mut material = fabric.material();
+            if !own {
+                let Material { stretch, weft, shear, .. } = plain;
+                material = Material { stretch, weft, shear, ..material };
+            }
+            found.push(drape(stage, material, rings, 0.0)?);
+        }
+        let falls = found.windows(2).map(|w| w[0] - w[1]).fold(0.0f64, f64::max);
+        let said: Vec<String> = found.iter().map(|d| format!("{d:.1}")).collect();
+        let reference = format!("by B/w: {}", said.join(", "));
+        let membrane = if own { "own membranes" } else { "one membrane for all" };
+        let what = format!("largest fall with rising B / w, {membrane}");
+        // Fabrics differ in their membranes too, and fold in whole numbers: what a drape test
+        // repeats to within counts as level.
+        stage.row(what, falls, "points", reference, Limit::AtMost(REPEATS));
     }
-    let falls = found.windows(2).map(|w| w[0] - w[1]).fold(0.0f64, f64::max);
-    let said: Vec<String> = found.iter().map(|d| format!("{d:.1}")).collect();
-    let reference = format!("by B/w: {}", said.join(", "));
-    stage.row("largest fall with rising B / w", falls, "points", reference, Limit::AtMost(0.0));
     if stage.settings.quick {
         return Ok(());
     }
-    let denim = find("denim").unwrap_or(&FABRICS[0]);
+    let denim = find("denim").unwrap_or(&FABRICS[0]).material();
     let plain = drape(stage, denim, rings, 0.0)?;
     let turned = drape(stage, denim, rings, std::f32::consts::FRAC_PI_4)?;
     let reference = format!("{plain:.1}");
     let moved = (turned - plain).abs();
-    stage.row("mesh turned by 45 deg, denim", moved, "points", reference, Limit::AtMost(3.0));
+    stage.row("mesh turned by 45 deg, denim", moved, "points", reference, Limit::AtMost(REPEATS));
     let fine = drape(stage, denim, 2 * rings, 0.0)?;
     let moved = (fine - plain).abs();
     let reference = format!("{fine:.1} at 4 times the vertices");
-    stage.row(
-        "against 4 times the vertices, denim",
-        moved,
-        "points",
-        reference,
-        Limit::AtMost(3.0),
-    );
+    let what = "against 4 times the vertices, denim";
+    stage.row(what, moved, "points", reference, Limit::AtMost(REPEATS));
     Ok(())
 }
 
@@ -68,12 +77,17 @@ fn stiffness(f: &Fabric) -> f32 {
 }
 
 /// Drape coefficient (%): how much of the ring's area is in shadow.
-fn drape(stage: &mut Stage<'_>, fabric: &Fabric, rings: u32, turn: f32) -> Result<f64, LabError> {
+fn drape(
+    stage: &mut Stage<'_>,
+    material: Material,
+    rings: u32,
+    turn: f32,
+) -> Result<f64, LabError> {
     let mesh = disc(OUTER_M, INNER_M, rings, turn)?.with_grain(Vec3::Z);
     let held: Vec<u32> = (0..mesh.vertex_count() as u32)
         .filter(|v| mesh.rest_positions()[*v as usize].length() < INNER_M + 1e-5)
         .collect();
-    let material = Material { drag: 0.0, damping_s: 0.0, ..fabric.material() };
+    let material = Material { drag: 0.0, damping_s: 0.0, ..material };
     let model = Model::new(mesh, material, Environment::default(), None, &held)?;
     let mut sim = stage.sim(model, 1.0 / 30.0);
     // A flat disc cannot choose its folds.

@@ -14,13 +14,14 @@ mod drape;
 mod energy;
 mod fall;
 mod hang;
-pub mod hits;
 mod mesh_faults;
 mod momentum;
 mod repeat;
 pub mod shapes;
 mod sheets;
 mod slide;
+mod soak;
+mod speed;
 mod stage;
 mod sweep;
 mod swing;
@@ -167,7 +168,7 @@ pub const BENCHES: &[Bench] = &[
     fall::A1, hang::A2, swing::A3, swing::A4, hang::A5, bending::A6, bending::A7, drape::A8,
     fall::A9, slide::A10, momentum::A12, energy::A13,
     sheets::B1, sheets::B2, sweep::B3, mesh_faults::B4,
-    repeat::D2, repeat::D3,
+    soak::D1, repeat::D2, repeat::D3, speed::D4,
     sheets::S1, sheets::S2,
 ];
 

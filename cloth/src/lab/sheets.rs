@@ -4,6 +4,7 @@ use glam::Vec3;
 
 use super::shapes::{Cut, ellipsoids, sheet};
 use super::{Bench, LabError, Limit, Sim, Stage};
+use crate::body::Pose;
 use crate::material::Material;
 use crate::measure;
 use crate::model::{Environment, Model};
@@ -110,8 +111,8 @@ fn pinned(stage: &mut Stage<'_>) -> Result<(), LabError> {
     Ok(())
 }
 
-fn on_ball(stage: &mut Stage<'_>) -> Result<(), LabError> {
-    let n = stage.side(32);
+/// S2 with `n` vertices a side, on the stage, and the pose in which the ball stays.
+pub(crate) fn ball_sheet(stage: &mut Stage<'_>, n: u32) -> Result<(Sim, Pose), LabError> {
     let top = DROP_M + BALL_M;
     let place = |u: f32, v: f32| Vec3::new(u - 0.5, top, v - 0.5);
     let mesh = sheet(n - 1, n - 1, Cut::Alternating, place)?;
@@ -119,7 +120,12 @@ fn on_ball(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let pose = body.skeleton.rest_pose();
     let material = stage.material(material());
     let model = Model::new(mesh, material, Environment::default(), Some(body), &[])?;
-    let mut sim = stage.sim(model, FRAME_S);
+    Ok((stage.sim(model, FRAME_S), pose))
+}
+
+fn on_ball(stage: &mut Stage<'_>) -> Result<(), LabError> {
+    let n = stage.side(32);
+    let (mut sim, pose) = ball_sheet(stage, n)?;
     sim.hits_every = 10;
     let mut lowest = Lowest::new();
     for _ in 0..FRAMES {
@@ -130,7 +136,7 @@ fn on_ball(stage: &mut Stage<'_>) -> Result<(), LabError> {
         stage.tally.penetration_m = stage.tally.penetration_m.max(depth);
     }
     // Heights count from the release, as the peers' do.
-    stage.tally.lowest_m -= top;
+    stage.tally.lowest_m -= DROP_M + BALL_M;
     stage.tally.stretch_p99 = lowest.p99;
     stage.tally.stretch_max = lowest.max;
     let t = stage.tally;

@@ -2,9 +2,9 @@
 
 use glam::Vec3;
 
-use super::hits;
 use super::{LabError, Limit, Row};
 use crate::body::Pose;
+use crate::crossings::Crossings;
 use crate::fabrics::Fabric;
 use crate::material::Material;
 use crate::measure;
@@ -139,6 +139,7 @@ pub struct Sim {
     pub hits_every: u64,
     frames: u64,
     run: u32,
+    crossings: Crossings,
     workspace: Workspace,
 }
 
@@ -212,6 +213,7 @@ impl<'a> Stage<'a> {
         let state = model.rest_state();
         self.tally.vertices = self.tally.vertices.max(state.positions.len());
         Sim {
+            crossings: Crossings::new(model.mesh()),
             state,
             model,
             frame_s,
@@ -254,7 +256,7 @@ impl<'a> Stage<'a> {
         if (self.watch)(&shot) { Ok(()) } else { Err(LabError::Stopped) }
     }
 
-    fn measure(&mut self, sim: &Sim) {
+    fn measure(&mut self, sim: &mut Sim) {
         let (mesh, at) = (sim.model.mesh(), &sim.state.positions);
         let t = &mut self.tally;
         t.frames += 1;
@@ -267,7 +269,8 @@ impl<'a> Stage<'a> {
         let fastest = sim.state.velocities.iter().map(|v| v.length_squared()).fold(0.0, f32::max);
         t.speed_max_m_s = t.speed_max_m_s.max(fastest.sqrt());
         if sim.hits_every > 0 && sim.frames.is_multiple_of(sim.hits_every) {
-            t.self_hits = t.self_hits.max(hits::count(mesh, at));
+            let hits = sim.crossings.find(at).len();
+            t.self_hits = t.self_hits.max(hits as u64);
         }
     }
 

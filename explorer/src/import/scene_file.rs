@@ -34,6 +34,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use cloth::fabrics;
 use protocol::limits::NAME_BYTES_MAX;
 use serde::Deserialize;
 
@@ -181,6 +182,8 @@ pub struct AttachTable {
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MaterialTable {
+    /// A measured fabric's name; the other keys change it.
+    fabric: Option<String>,
     density: Option<f32>,
     stretch: Option<f32>,
     weft: Option<f32>,
@@ -344,7 +347,14 @@ impl GarmentTable {
     /// # Errors
     /// A value out of range.
     pub fn fabric(&self) -> Result<Fabric, SceneFileError> {
-        let (m, default) = (&self.material, Fabric::default());
+        let m = &self.material;
+        let default = match &m.fabric {
+            None => Fabric::default(),
+            Some(name) => fabrics::find(name).map(fabrics::Fabric::material).ok_or_else(|| {
+                let known = fabrics::names();
+                value("garment.material.fabric", &format!("there is no `{name}`; give {known}"))
+            })?,
+        };
         let field = |key: &str, given: Option<f32>, default: f32, range: [f32; 2]| {
             let number = given.unwrap_or(default);
             in_range(&format!("garment.material.{key}"), number, range)?;
@@ -450,5 +460,29 @@ pub(super) fn in_range(
         Ok(())
     } else {
         Err(value(key, &format!("{number} is out of range; give {low} to {high}")))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fabric_of(material: &str) -> Result<Fabric, SceneFileError> {
+        let text = format!(
+            "name = \"a\"\n[character]\nfile = \"a.glb\"\n[motion_graph]\nfile = \"a.json\"\n\
+             [garment]\nfile = \"a.obj\"\n[garment.material]\n{material}"
+        );
+        SceneFile::parse(&text)?.garment()?.fabric()
+    }
+
+    #[test]
+    fn a_fabric_is_named_and_changed_key_by_key() {
+        let denim = fabrics::find("denim").unwrap().material();
+        assert_eq!(fabric_of("fabric = \"denim\"").unwrap(), denim);
+        let thin = fabric_of("fabric = \"Denim\"\ndensity = 0.1").unwrap();
+        assert_eq!(thin, Fabric { density: 0.1, ..denim });
+        assert_eq!(fabric_of("").unwrap(), Fabric::default());
+        let error = fabric_of("fabric = \"velvet\"").unwrap_err().to_string();
+        assert!(error.contains("velvet") && error.contains("rib-knit"), "{error}");
     }
 }
