@@ -17,6 +17,7 @@
 
 pub mod body;
 pub mod bvh;
+pub mod coarse;
 pub mod crossings;
 pub mod fabrics;
 pub mod lab;

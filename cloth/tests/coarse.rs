@@ -1,0 +1,346 @@
+//! The run-time face: what it must survive (wind, shaking, fast balls, any step, teleports, any
+//! material, long runs), and that it hangs, swings and rests as cloth does.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+use cloth::coarse::{Capsule, Coarse, CoarseError, Input, Moving, Settings, Workspace};
+use cloth::{Environment, Material, Mesh, State, Vec3};
+use rand_core::Rng;
+use rand_pcg::Pcg64Mcg;
+
+/// Counts the allocations of each thread.
+struct Counting;
+
+thread_local!(static ALLOCATIONS: Cell<usize> = const { Cell::new(0) });
+
+#[allow(unsafe_code)] // a global allocator cannot be written otherwise
+// SAFETY: every call is passed on to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.with(|a| a.set(a.get() + 1));
+        // SAFETY: the caller's promises are the system's.
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: as above.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+const DT: f32 = 1.0 / 60.0;
+
+/// A hanging sheet of n x n points and one square metre, held along its top edge.
+struct Flag {
+    model: Coarse,
+    state: State,
+    workspace: Workspace,
+    pins: Vec<Vec3>,
+    n: u32,
+}
+
+fn sheet(n: u32) -> Mesh {
+    let at = |i: u32| {
+        Vec3::new((i % n) as f32 / (n - 1) as f32, 2.0 - (i / n) as f32 / (n - 1) as f32, 0.0)
+    };
+    let cell = |i: u32| [[i, i + n, i + 1], [i + 1, i + n, i + n + 1]];
+    let cells = (0..n * (n - 1)).filter(|i| i % n + 1 < n);
+    Mesh::new((0..n * n).map(at).collect(), cells.flat_map(cell).collect()).unwrap()
+}
+
+impl Flag {
+    fn new(n: u32, material: Material) -> Self {
+        let pinned: Vec<u32> = (0..n).collect();
+        let environment = Environment::default();
+        let settings = Settings::default();
+        let model = Coarse::new(sheet(n), material, environment, &pinned, settings).unwrap();
+        let state = model.rest_state();
+        let pins = state.positions[..n as usize].to_vec();
+        Self { model, state, workspace: Workspace::default(), pins, n }
+    }
+
+    fn step(&mut self, seconds: f32, wind: Vec3, colliders: &[Moving]) {
+        let input = Input { pins: &self.pins, colliders, wind, push: &[], seconds };
+        self.model.step(&input, &mut self.state, &mut self.workspace).unwrap();
+    }
+
+    /// Largest distance of a point from the pins' middle (m).
+    fn extent(&self) -> f32 {
+        let middle = self.pins.iter().sum::<Vec3>() / self.pins.len() as f32;
+        let far = |p: &Vec3| if p.is_finite() { p.distance(middle) } else { f32::INFINITY };
+        self.state.positions.iter().map(far).fold(0.0, f32::max)
+    }
+
+    /// Largest stretch of an edge.
+    fn stretch(&self) -> f32 {
+        let mesh = self.model.mesh();
+        let x = &self.state.positions;
+        let one =
+            |(e, rest): (&[u32; 2], &f32)| x[e[0] as usize].distance(x[e[1] as usize]) / rest - 1.0;
+        mesh.edges().iter().zip(mesh.rest_lengths()).map(one).fold(0.0, f32::max)
+    }
+
+    fn speed(&self) -> f32 {
+        self.state.velocities.iter().map(|v| v.length()).fold(0.0, f32::max)
+    }
+
+    /// Lets it hang in calm air; returns the seconds until nothing moves faster than 5 cm/s.
+    fn rest(&mut self, most_s: f32) -> f32 {
+        let steps = (most_s / DT) as u32;
+        let mut since = 0;
+        for step in 0..steps {
+            self.step(DT, Vec3::ZERO, &[]);
+            if self.speed() > 0.05 {
+                since = step + 1;
+            }
+        }
+        since as f32 * DT
+    }
+}
+
+/// A sheet of 1 m held along 1 m never reaches further than this from the middle of its pins, even
+/// at the strain limit (m).
+const EXTENT_MAX: f32 = 1.7;
+
+#[test]
+fn a_hanging_sheet_stretches_by_its_weight_and_no_more() {
+    let mut flag = Flag::new(14, Material { drag: 8.0, ..Material::default() });
+    for _ in 0..600 {
+        flag.step(DT, Vec3::ZERO, &[]);
+    }
+    let lowest = flag.state.positions.iter().map(|p| p.y).fold(f32::INFINITY, f32::min);
+    // w L^2 / (2 Eh) = 0.2 * 9.81 / 2000 m.
+    let expected = 0.2 * 9.81 / 2000.0;
+    assert!((1.0 - lowest - expected).abs() < 0.5 * expected, "{lowest}");
+}
+
+#[test]
+fn a_swinging_sheet_never_gains_energy_and_keeps_its_size() {
+    for n in [7, 14] {
+        let mut flag = Flag::new(n, Material { drag: 0.0, ..Material::default() });
+        // Held level, let go.
+        for (i, p) in flag.state.positions.iter_mut().enumerate() {
+            *p = Vec3::new(p.x, 2.0, (i as u32 / n) as f32 / (n - 1) as f32);
+        }
+        let mut before = flag.model.energy(&flag.state);
+        let (first, mut lowest) = (before, f32::INFINITY);
+        for step in 0..240 {
+            flag.step(DT, Vec3::ZERO, &[]);
+            let energy = flag.model.energy(&flag.state);
+            // What stretched threads give back: 2 % of the sheet's weight times its length.
+            assert!(energy < before + 0.04, "{n} {step}: {before} {energy} J");
+            assert!(flag.stretch() < 0.13, "{n} {step}: {}", flag.stretch());
+            before = energy;
+            lowest = flag.state.positions.iter().fold(lowest, |l, p| l.min(p.y));
+        }
+        assert!(before < first && (0.95..1.02).contains(&lowest), "{n}: lowest point {lowest}");
+    }
+}
+
+#[test]
+fn strong_wind_and_a_shaken_pole_leave_it_bounded_and_it_comes_to_rest() {
+    let mut flag = Flag::new(14, Material::default());
+    for step in 0..600 {
+        let t = step as f32 * DT;
+        // Four times a strong breeze of 8 m/s, and a pole shaken by 15 cm at 5 Hz.
+        flag.step(DT, Vec3::new(10.0 * t.sin(), 0.0, 32.0), &[]);
+        let sway = 0.15 * (std::f32::consts::TAU * 5.0 * t).sin();
+        for (i, pin) in flag.pins.iter_mut().enumerate() {
+            *pin = Vec3::new(i as f32 / 13.0 + sway, 2.0, 0.0);
+        }
+        assert!(flag.extent() < EXTENT_MAX, "{step}: {}", flag.extent());
+        assert!(flag.stretch() < 0.4, "{step}: {}", flag.stretch());
+    }
+    let seconds = flag.rest(20.0);
+    assert!(seconds < 15.0, "still moving after {seconds} s");
+}
+
+#[test]
+fn a_ball_of_thirty_metres_a_second_takes_it_along_not_apart() {
+    for dt in [1.0 / 20.0, 1.0 / 60.0, 1.0 / 240.0] {
+        let mut flag = Flag::new(14, Material::default());
+        for step in 0..(2.0 / dt) as i32 {
+            let at = |s: f32| Vec3::new(0.5, 1.5, -3.0 + 30.0 * s * dt);
+            let ball = |s| Capsule::sphere(at(s), 0.15);
+            let moving = Moving { from: ball(step as f32), to: ball(step as f32 + 1.0) };
+            flag.step(dt, Vec3::ZERO, &[moving]);
+            assert!(flag.extent() < EXTENT_MAX, "{dt} {step}: {}", flag.extent());
+        }
+        let seconds = flag.rest(30.0);
+        assert!(seconds < 25.0, "{dt}: still moving after {seconds} s");
+        assert!(flag.stretch() < 0.02, "{dt}: {}", flag.stretch());
+    }
+}
+
+#[test]
+fn a_sheet_dropped_on_a_sphere_stays_outside_of_it() {
+    let n = 14;
+    let settings = Settings { expansion_m: 0.01, ..Settings::default() };
+    let material = Material::default();
+    let environment = Environment { ground: true, ..Environment::default() };
+    let model = Coarse::new(sheet(n), material, environment, &[], settings).unwrap();
+    let mut state = model.rest_state();
+    for (i, p) in state.positions.iter_mut().enumerate() {
+        *p = Vec3::new(p.x - 0.5, 0.85, (i as u32 / n) as f32 / (n - 1) as f32 - 0.5);
+    }
+    let ball = Moving::resting(Capsule::sphere(Vec3::new(0.0, 0.5, 0.0), 0.3));
+    let mut workspace = Workspace::default();
+    for step in 0..600 {
+        let input =
+            Input { pins: &[], colliders: &[ball], wind: Vec3::ZERO, push: &[], seconds: DT };
+        model.step(&input, &mut state, &mut workspace).unwrap();
+        for p in &state.positions {
+            let depth = 0.3 - p.distance(Vec3::new(0.0, 0.5, 0.0));
+            assert!(depth < 0.001 && p.y > 0.0, "{step}: {depth} m deep");
+        }
+    }
+    let speed = state.velocities.iter().map(|v| v.length()).fold(0.0, f32::max);
+    assert!(speed < 0.3, "it lies still: {speed} m/s");
+}
+
+#[test]
+fn any_length_of_step_and_any_material_stay_bounded() {
+    let m = Material::default;
+    let materials = [
+        Material { stretch: 1e5, shear: 4e4, bend: 1e-2, ..m() },
+        Material { stretch: 10.0, shear: 3.0, bend: 0.0, ..m() },
+        Material { density: 0.05, stretch: 2000.0, weft: Some(200.0), ..m() },
+        Material { density: 0.6, drag: 20.0, ..m() },
+    ];
+    for material in materials {
+        for dt in [1.0 / 20.0, 1.0 / 30.0, 1.0 / 120.0, 1.0 / 240.0] {
+            let mut flag = Flag::new(10, material);
+            for step in 0..(3.0 / dt) as i32 {
+                let t = step as f32 * dt;
+                flag.step(dt, Vec3::new(0.0, 3.0, 15.0 * (2.0 * t).sin()), &[]);
+                assert!(flag.extent() < EXTENT_MAX, "{material:?} {dt} {t}: {}", flag.extent());
+            }
+        }
+    }
+}
+
+#[test]
+fn a_teleport_takes_the_cloth_along() {
+    let mut flag = Flag::new(14, Material::default());
+    for _ in 0..60 {
+        flag.step(DT, Vec3::new(1.0, 0.0, 5.0), &[]);
+    }
+    flag.rest(3.0);
+    let before = flag.state.clone();
+    let far = Vec3::new(100.0, -20.0, 300.0);
+    flag.pins.iter_mut().for_each(|p| *p += far);
+    flag.step(DT, Vec3::ZERO, &[]);
+    for (p, old) in flag.state.positions.iter().zip(&before.positions) {
+        assert!((*p - *old - far).length() < 0.02, "{p} {old}");
+    }
+    assert!(flag.speed() < 1.0, "{}", flag.speed());
+    // Turned on the spot as well: bounded, and at rest again soon.
+    let middle = flag.pins.iter().sum::<Vec3>() / 14.0;
+    flag.pins.iter_mut().for_each(|p| *p = middle - (*p - middle));
+    flag.step(DT, Vec3::ZERO, &[]);
+    assert!(flag.extent() < EXTENT_MAX, "{}", flag.extent());
+    let seconds = flag.rest(20.0);
+    assert!(seconds < 15.0 && flag.stretch() < 0.02, "{seconds} {}", flag.stretch());
+}
+
+/// Random wind, shaking, balls, lengths of step and teleports; bounded at every step.
+fn unattended(n: u32, steps: u32) {
+    let mut rng = Pcg64Mcg::new(5);
+    let mut unit = move || (rng.next_u32() >> 8) as f32 / (1 << 24) as f32;
+    let mut flag = Flag::new(n, Material::default());
+    let (mut wind, mut dt, mut ball) = (Vec3::ZERO, DT, Vec3::new(0.5, 1.4, -50.0));
+    let mut speed = Vec3::ZERO;
+    for step in 0..steps {
+        if step % 97 == 0 {
+            wind = Vec3::new(unit() - 0.5, 0.3 * (unit() - 0.5), unit() - 0.5) * 64.0;
+            dt = 1.0 / (20.0 + 220.0 * unit());
+        }
+        if step % 211 == 0 {
+            ball = Vec3::new(unit(), 1.0 + unit(), -3.0) + flag.pins[0];
+            speed = Vec3::new(0.0, 0.0, 30.0 * unit());
+        }
+        if step % 5003 == 0 {
+            let far = Vec3::new(unit(), unit(), unit()) * 100.0 - 50.0;
+            flag.pins.iter_mut().for_each(|p| *p += far);
+        }
+        let sway = 0.1 * (step as f32 * 0.5).sin() - 0.1 * ((step as f32 - 1.0) * 0.5).sin();
+        flag.pins.iter_mut().for_each(|p| p.x += sway);
+        let to = ball + speed * dt;
+        let moving = Moving { from: Capsule::sphere(ball, 0.1), to: Capsule::sphere(to, 0.1) };
+        ball = to;
+        flag.step(dt, wind, &[moving]);
+        assert!(flag.extent() < EXTENT_MAX && flag.speed() <= 40.001, "{step}: {}", flag.extent());
+    }
+    let seconds = flag.rest(30.0);
+    assert!(seconds < 20.0 && flag.stretch() < 0.02, "{seconds} s, {}", flag.stretch());
+}
+
+#[test]
+fn a_hundred_thousand_steps_unattended() {
+    unattended(5, 100_000);
+}
+
+#[test]
+#[ignore = "half a minute; run with --ignored"]
+fn a_hundred_thousand_steps_of_196_points_unattended() {
+    unattended(14, 100_000);
+}
+
+#[test]
+fn equal_inputs_give_equal_bits_and_nothing_is_allocated() {
+    let run = |warm: u32| {
+        let mut flag = Flag::new(9, Material::default());
+        let mut workspace = Workspace::default();
+        for _ in 0..warm {
+            // A workspace that served another length of step before.
+            let mut other = flag.state.clone();
+            let (pins, wind) = (&flag.pins[..], Vec3::Z);
+            let input = Input { pins, colliders: &[], wind, push: &[], seconds: 0.03 };
+            flag.model.step(&input, &mut other, &mut workspace).unwrap();
+        }
+        flag.workspace = workspace;
+        let ball = Moving::resting(Capsule::sphere(Vec3::new(0.4, 1.3, 0.05), 0.2));
+        flag.step(DT, Vec3::new(1.0, 0.0, 6.0), &[ball]);
+        let before = ALLOCATIONS.get();
+        for _ in 0..50 {
+            flag.step(DT, Vec3::new(1.0, 0.0, 6.0), &[ball]);
+        }
+        assert_eq!(ALLOCATIONS.get(), before, "allocations per step");
+        assert_eq!(flag.n, 9);
+        flag.state
+    };
+    assert_eq!(run(0), run(3));
+}
+
+#[test]
+fn what_makes_no_sense_is_refused_and_changes_nothing() {
+    let pinned = [3, 2];
+    let made = |pins: &[u32], settings: Settings| {
+        Coarse::new(sheet(5), Material::default(), Environment::default(), pins, settings).err()
+    };
+    assert_eq!(made(&pinned, Settings::default()), Some(CoarseError::Pinned(2)));
+    assert_eq!(made(&[25], Settings::default()), Some(CoarseError::Pinned(25)));
+    let bad = Settings { compression: f32::NAN, ..Settings::default() };
+    assert!(matches!(made(&[], bad), Some(CoarseError::Settings(_))));
+    let mut flag = Flag::new(5, Material::default());
+    let before = flag.state.clone();
+    let good = Input { pins: &flag.pins, colliders: &[], wind: Vec3::ZERO, push: &[], seconds: DT };
+    let ball = [Moving::resting(Capsule::sphere(Vec3::NAN, 0.1))];
+    let pins = vec![Vec3::splat(f32::INFINITY); 5];
+    for input in [
+        Input { pins: &[], ..good },
+        Input { pins: &pins, ..good },
+        Input { colliders: &ball, ..good },
+        Input { wind: Vec3::NAN, ..good },
+        Input { push: &[Vec3::ZERO], ..good },
+        Input { seconds: 0.0, ..good },
+        Input { seconds: f32::NAN, ..good },
+    ] {
+        let refused = flag.model.step(&input, &mut flag.state, &mut flag.workspace);
+        assert!(refused.is_err(), "{input:?}");
+        assert_eq!(flag.state, before);
+    }
+}
