@@ -19,7 +19,7 @@ fn main() {
         .expect("a plain sheet");
     let pinned: Vec<u32> = (0..N).collect();
     let pins: Vec<Vec3> = pinned.iter().map(|v| at(*v)).collect();
-    for passes in [2, 4, 8] {
+    for passes in [4, 6, 8] {
         let settings = Settings { passes, ..Settings::default() };
         let model = Coarse::new(
             mesh.clone(),

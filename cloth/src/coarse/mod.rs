@@ -53,13 +53,16 @@ pub struct Settings {
     /// How much of its resistance the membrane has against being compressed (0..=1). Less than 1 lets
     /// a coarse mesh shrink where a fine one would fold (Kavan et al. 2011, section 6).
     pub compression: f32,
+    /// Share of a point's speed against the pins' that is lost per second (1/s): what air and seams
+    /// take from slow swinging, which drag leaves alone.
+    pub damping_per_s: f32,
     /// Added to every collider's radius (m), so that the fine points stay out as well.
     pub expansion_m: f32,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { passes: 4, sweeps: 4, compression: 1.0, expansion_m: 0.0 }
+        Self { passes: 6, sweeps: 4, compression: 1.0, damping_per_s: 0.5, expansion_m: 0.0 }
     }
 }
 
@@ -133,7 +136,10 @@ pub enum CoarseError {
     #[error("pinned point {0} must exist and be listed once, in ascending order")]
     Pinned(u32),
     /// Settings that make no sense.
-    #[error("settings {0:?}: 1..=64 passes, up to 64 sweeps, compression 0..=1, expansion 0..=1 m")]
+    #[error(
+        "settings {0:?}: 1..=64 passes, up to 64 sweeps, compression 0..=1, damping 0..=100 a \
+             second, expansion 0..=1 m"
+    )]
     Settings(Settings),
     /// A list of another length.
     #[error("{actual} {what} where {expected} are needed")]
@@ -177,8 +183,9 @@ impl Coarse {
                 return Err(CoarseError::Pinned(*pin));
             }
         }
-        let Settings { passes, sweeps, compression, expansion_m } = settings;
-        let fine = (1..=64).contains(&passes) && sweeps <= 64;
+        let Settings { passes, sweeps, compression, damping_per_s, expansion_m } = settings;
+        let fine =
+            (1..=64).contains(&passes) && sweeps <= 64 && (0.0..=100.0).contains(&damping_per_s);
         if !fine || !(0.0..=1.0).contains(&compression) || !(0.0..=1.0).contains(&expansion_m) {
             return Err(CoarseError::Settings(settings));
         }
@@ -251,6 +258,7 @@ impl Coarse {
             self.pass(dt, ws);
             self.push_out(ws);
         }
+        self.hold_leashes(ws);
         for _ in 0..self.settings.sweeps {
             self.shorten(ws);
             self.push_out(ws);
@@ -274,7 +282,7 @@ impl Coarse {
             }
         }
         let bad = |what, list: &[Vec3]| {
-            let index = list.iter().position(|p| !(p.abs().max_element() <= FAR) || p.is_nan());
+            let index = list.iter().position(|p| p.is_nan() || p.abs().max_element() > FAR);
             index.map_or(Ok(()), |index| Err(CoarseError::Unsound { what, index }))
         };
         bad("pin", input.pins)?;
@@ -320,7 +328,7 @@ impl Coarse {
         for (t, (gradients, area)) in self.mesh.triangles().iter().zip(shapes) {
             for (a, ga) in t.iter().zip(gradients) {
                 for (b, gb) in t.iter().zip(gradients) {
-                    let value = area * self.constants.stiffest() * ga.dot(*gb);
+                    let value = area * self.constants.stiffness() * ga.dot(*gb);
                     add(*a as usize, *b as usize, value);
                 }
             }
@@ -356,11 +364,16 @@ impl Coarse {
         let drag = 0.5 * self.environment.air_density * self.material.drag;
         let gravity = Vec3A::from(self.environment.gravity);
         let wind = Vec3A::from(input.wind).clamp_length_max(4.0 * SPEED_MAX_M_S);
+        let ways = self.pinned.iter().zip(input.pins);
+        let ways = ways.map(|(v, pin)| Vec3A::from(*pin) - ws.start[*v as usize]);
+        let led = ways.sum::<Vec3A>() / (dt * self.pinned.len().max(1) as f32);
+        let damping = dt * self.settings.damping_per_s;
         ws.aim.clear();
         for i in 0..count {
             let push = input.push.get(i).map_or(Vec3A::ZERO, |a| Vec3A::from(*a));
             let mut v = Vec3A::from(state.velocities[i]).clamp_length_max(SPEED_MAX_M_S);
             v += (gravity + push) * dt;
+            v -= (v - led) * (damping / (1.0 + damping));
             // Implicit in the velocity along the normal: air can stop a point, not throw it back.
             let n = ws.normals[i].normalize_or_zero();
             let against = n.dot(v - wind);
