@@ -105,9 +105,13 @@ fn forecast(p: &Progress, frames: Option<u64>) -> String {
         .cost
         .free_bytes
         .map_or(String::new(), |free| format!(" ({} are free)", format::bytes(free)));
+    let cpu_s = left as f64 * p.cost.cpu_s;
+    let cpu = match cpu_s {
+        s if s < 600.0 => format!("{s:.0} CPU s"),
+        s => format!("{:.1} CPU h", s / 3600.0),
+    };
     format!(
-        "{what}about {:.2} CPU h and {} in the work folder{free}",
-        left as f64 * p.cost.cpu_s / 3600.0,
+        "{what}about {cpu} and {} in the work folder{free}",
         format::bytes(left * p.cost.work_bytes)
     )
 }

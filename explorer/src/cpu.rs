@@ -24,8 +24,34 @@ impl CpuClock {
     }
 }
 
-/// Linux tells the nanoseconds that a thread spent on a CPU in the first field of this file.
+/// CPU time of the whole process so far, where the system tells it (s).
+pub fn process_cpu_s() -> Option<f64> {
+    process_cpu_ns().map(|ns| ns as f64 * 1e-9)
+}
+
+#[cfg(unix)]
 fn thread_cpu_ns() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
-    text.split_whitespace().next()?.parse().ok().filter(|ns| *ns > 0)
+    nanoseconds(rustix::time::ClockId::ThreadCPUTime)
+}
+
+#[cfg(unix)]
+fn process_cpu_ns() -> Option<u64> {
+    nanoseconds(rustix::time::ClockId::ProcessCPUTime)
+}
+
+#[cfg(unix)]
+fn nanoseconds(clock: rustix::time::ClockId) -> Option<u64> {
+    let time = rustix::time::clock_gettime(clock);
+    let seconds = u64::try_from(time.tv_sec).ok()?;
+    Some(seconds * 1_000_000_000 + u64::try_from(time.tv_nsec).ok()?)
+}
+
+#[cfg(not(unix))]
+fn thread_cpu_ns() -> Option<u64> {
+    None
+}
+
+#[cfg(not(unix))]
+fn process_cpu_ns() -> Option<u64> {
+    None
 }

@@ -88,9 +88,6 @@ pub enum ExploreError {
     /// A clip that is not there.
     #[error("there is no clip {0:?} to explore in; the scene has {1}")]
     NoClip(String, String),
-    /// What players walked could not be read.
-    #[error("reading what players walked: {0}")]
-    Telemetry(#[from] object_store::Error),
     /// The garment could not be draped on the start pose.
     #[error("draping the garment: {0}")]
     Drape(SimulateError),
@@ -279,7 +276,11 @@ async fn between_rounds(
 ) -> Result<Option<End>, ExploreError> {
     if work.ledger().phase() == Phase::Drape {
         let clock = CpuClock::start();
-        let frame = simulator.drape().map_err(ExploreError::Drape)?;
+        let mut frame = simulator.drape();
+        if frame.is_err() && simulator.may_recover() {
+            frame = simulator.drape();
+        }
+        let frame = frame.map_err(ExploreError::Drape)?;
         run.drape_cpu_s = clock.elapsed_s();
         work.drape(&frame)?;
         progress(&run.progress(setup, work, None));
@@ -322,10 +323,11 @@ async fn steer(
     }
     let steering = work.ledger().steering();
     let after = steering.telemetry();
-    let walked = match policy {
-        Policy::Visited => publisher.walked(after).await?,
-        Policy::Greedy | Policy::Predictive => Walked { newest: after, ..Walked::default() },
-    };
+    // Whatever the policy: errors are reported as players see them.
+    let walked = publisher.walked(after).await.unwrap_or_else(|error| {
+        tracing::warn!(%error, "what players walked cannot be read; exploring goes on");
+        Walked { newest: after, ..Walked::default() }
+    });
     if steering.policy() != policy || steering.clips() != clips || walked.newest != after {
         let (clips, telemetry) = (clips.to_vec(), walked.newest);
         let counts = walked.counts.into_iter().collect();

@@ -7,6 +7,7 @@ use protocol::VersionNumber;
 use serde::Serialize;
 
 use super::Setup;
+use crate::cpu::process_cpu_s;
 use crate::disk::free_bytes;
 use crate::grow::class;
 use crate::grow::graph::Kind;
@@ -251,13 +252,4 @@ fn visited_mm(work: &Work) -> [f64; 2] {
         above >= 0.05 * all
     });
     [at.map_or(0.0, |(error_m, _)| 1e3 * error_m), 1e3 * mean / all.max(1e-300)]
-}
-
-/// CPU seconds of this process. Linux tells them in ticks of 10 ms.
-fn process_cpu_s() -> Option<f64> {
-    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
-    // The name in parentheses may hold anything, so count from its end.
-    let fields: Vec<&str> = text.rsplit_once(')')?.1.split_whitespace().collect();
-    let ticks: u64 = fields.get(11)?.parse::<u64>().ok()? + fields.get(12)?.parse::<u64>().ok()?;
-    Some(ticks as f64 / 100.0)
 }

@@ -25,6 +25,8 @@ struct Version {
 #[derive(Debug, Default, Clone, PartialEq)]
 struct Memory {
     versions: Vec<Version>,
+    /// What players walked, as batches.
+    walked: Vec<Walked>,
 }
 
 impl Publish for Memory {
@@ -51,7 +53,13 @@ impl Publish for Memory {
     }
 
     async fn walked(&self, after: u64) -> Result<Walked, object_store::Error> {
-        Ok(Walked { newest: after, ..Walked::default() })
+        let new = self.walked.iter().filter(|walked| walked.newest > after);
+        let mut all = Walked { newest: after, ..Walked::default() };
+        for walked in new {
+            all.newest = walked.newest;
+            all.counts.extend(&walked.counts);
+        }
+        Ok(all)
     }
 }
 
@@ -163,7 +171,7 @@ fn killed_anywhere_it_goes_on_to_the_same_files_and_versions() {
                 torn.extend_from_slice(b"torn");
             }
             std::fs::write(path("states"), torn).unwrap();
-            let mut resumed = Memory { versions };
+            let mut resumed = Memory { versions, ..Memory::default() };
             explore(&scene, &toy, (folder.path(), &mut resumed), &options).unwrap();
             assert!(files(folder.path()) == [journal.clone(), states.clone()], "cut at {cut}");
             assert!(resumed == store, "cut at {cut}, {held} versions");
@@ -423,3 +431,6 @@ fn the_published_store_is_equal_for_any_workers_and_after_any_stop() {
         assert!(*expected == found, "{workers} workers, {patience}");
     }
 }
+
+#[path = "explore_scale_tests.rs"]
+mod scale;

@@ -97,3 +97,28 @@ fn up_explores_serves_and_plays_and_goes_on_where_it_stopped() {
     assert!(second["frames_played"].as_u64().unwrap() > 0, "plays at once: {second}");
     std::thread::sleep(Duration::from_millis(10));
 }
+
+#[test]
+fn merges_are_certified_replayed_drawn_and_compared() {
+    let store = path(shared_store());
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("merges.json");
+    let certificate = ["--certificate", path(&file), "--replay", "3", "--json"];
+    let found = toile_json(&[&["inspect", "--store", store][..], &certificate].concat());
+    assert_eq!(found["replayed"], 3, "{found}");
+    assert_eq!(found["largest_difference_mm"], 0.0, "{found}");
+    let page: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    let merges = page["merges"].as_array().unwrap();
+    assert_eq!(merges.len() as u64, found["merges"].as_u64().unwrap());
+    for key in ["pose", "clip", "error_mm", "class", "visits", "walked", "target"] {
+        assert!(merges[0].get(key).is_some(), "{key}");
+    }
+    let plots = folder.path().join("plots");
+    assert!(crate::run::toile(&["plot", store, "--out", path(&plots)]).status.success());
+    assert_eq!(std::fs::read_dir(&plots).unwrap().count(), 10);
+    let compared = toile_json(&["compare", store, "--walks", "1", "--frames", "15", "--json"]);
+    let rows = compared["rows"].as_array().unwrap();
+    assert!(rows.iter().any(|row| row["what"] == "floor" && row["horizon_s"] == 0.5));
+    assert_eq!(rows[0]["what"], "graph");
+}

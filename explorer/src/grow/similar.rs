@@ -367,4 +367,56 @@ mod tests {
         assert_eq!(all, (0..30).collect::<Vec<u32>>());
         assert_eq!(spread(&[Vec3::ZERO; 4], 2).len(), 2);
     }
+
+    /// `cargo test --release -p explorer -- --ignored --nocapture a_search_among`: 1,000 states of
+    /// 5,000 vertices, made of 20 smooth shapes.
+    #[test]
+    #[ignore = "prints times"]
+    fn a_search_among_a_thousand_states_of_a_pose() {
+        use rand_core::{Rng, SeedableRng};
+        const VERTICES: usize = 5000;
+        let mut random = rand_pcg::Pcg64Mcg::seed_from_u64(5);
+        let mut unit = || random.next_u32() as f32 / u32::MAX as f32 * 2.0 - 1.0;
+        let mut state = || {
+            let shapes: Vec<[f32; 3]> = (0..20).map(|_| [unit(), unit(), unit()]).collect();
+            let row = |v: usize, metres: f32| {
+                [0, 1, 2].map(|axis| {
+                    let x = v as f32 / VERTICES as f32;
+                    let wave = |(k, a): (usize, &[f32; 3])| {
+                        a[axis] * ((k + 1) as f32 * 3.0 * x + axis as f32).sin() / (k + 1) as f32
+                    };
+                    (shapes.iter().enumerate().map(wave).sum::<f32>() * metres * 16_384.0) as i16
+                })
+            };
+            GridState {
+                positions: (0..VERTICES).map(|v| row(v, 0.15)).collect(),
+                velocities: (0..VERTICES).map(|v| row(v, 0.05)).collect(),
+            }
+        };
+        let all: Vec<GridState> = (0..1050).map(|_| state()).collect();
+        let mut scene = toy::scene(toy::knot(), toy::settings());
+        scene.garment.positions =
+            (0..VERTICES).map(|v| Vec3::new(v as f32 / VERTICES as f32, 0.0, 0.0)).collect();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("states");
+        let file = StateFile::create(&path, VERTICES as u32, &[0; 32]).unwrap();
+        file.write(StateId(0), &all).unwrap();
+        let mut similar = Similar::new(&scene);
+        similar.keep_all(&file, vec![0; all.len()]).unwrap();
+        let candidates: Vec<StateId> = (0..1000).map(StateId).collect();
+        for (what, bound_m) in [("near a known state", 0.01), ("nearest", f32::INFINITY)] {
+            let clock = crate::cpu::CpuClock::start();
+            for state in &all[1000..] {
+                similar.nearest(&file, (state, 0), &candidates, bound_m).unwrap();
+            }
+            println!("{what}: {:.3} ms of CPU a search", 1e3 * clock.elapsed_s() / 50.0);
+        }
+        let clock = crate::cpu::CpuClock::start();
+        for state in &all[1000..1005] {
+            for id in &candidates {
+                similar.metric().distance(state, &file.read(*id).unwrap());
+            }
+        }
+        println!("comparing with all: {:.3} ms of CPU", 1e3 * clock.elapsed_s() / 5.0);
+    }
 }

@@ -8,6 +8,7 @@ use std::fs::{File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use protocol::StateId;
 
@@ -27,6 +28,9 @@ use super::view::View;
 use crate::grid::GridState;
 use crate::scene::Scene;
 use crate::simulator::Frame;
+
+/// How long to wait for a folder that is in use.
+const LOCK_PATIENCE: Duration = Duration::from_millis(300);
 
 /// Frames behind a merge in which its true error is looked for.
 const FUTURE_FRAMES: usize = 10;
@@ -473,11 +477,19 @@ fn at(path: &Path) -> impl Fn(io::Error) -> WorkError + use<> {
 fn lock(path: &Path) -> Result<File, WorkError> {
     let options = File::options().write(true).create(true).truncate(false).open(path);
     let file = options.map_err(at(path))?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(WorkError::Locked(path.to_owned())),
-        Err(TryLockError::Error(source)) => Err(at(path)(source)),
+    for last in [false, true] {
+        match file.try_lock() {
+            Ok(()) => break,
+            Err(TryLockError::WouldBlock) if last => {
+                return Err(WorkError::Locked(path.to_owned()));
+            }
+            // Whoever was killed just now, or is being started by another thread of its process,
+            // may hold it for an instant more.
+            Err(TryLockError::WouldBlock) => std::thread::sleep(LOCK_PATIENCE),
+            Err(TryLockError::Error(source)) => return Err(at(path)(source)),
+        }
     }
+    Ok(file)
 }
 
 fn open_cpu(path: &Path) -> io::Result<(File, f64)> {

@@ -29,7 +29,7 @@ const SAME_CLIP_FRAMES: usize = 20;
 /// Shortest clip that can be left and entered under these rules.
 const CLIP_FRAMES_MIN: usize = 2 * MARGIN_FRAMES;
 /// Beyond this distance no transition is taken for the sake of a shorter way (m).
-const DISTANCE_M_MAX: f32 = 0.25;
+const DISTANCE_M_MAX: f32 = 0.35;
 
 /// How many transitions are asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -322,3 +322,46 @@ proptest! {
         let _ = SceneFile::parse(&text);
     }
 }
+
+#[test]
+fn regions_metric_and_classes_are_resolved_or_refused_by_name() {
+    let class = "[[exploration.class]]\nname = \"collar\"\nregion = \"top\"\njoint = \"Head\"\n\
+        axis = [0.0, 2.0, 0.0]\nthreshold_m = 0.1\nvalues = [\"down\", \"up\"]\n\
+        implausible = [\"down\", \"up\"]\npenalty_mm = 500.0\n";
+    let metric = "[exploration.metric]\nnorm = \"rms\"\n\
+        weights = [{ region = \"top\", weight = 2.0 }]\n";
+    let whole = format!(
+        "{SCENE}edge_length_m = 0.1\n[garment.regions]\ntop = [{{ loop_near = \"Head\" }}]\n\
+         {metric}{class}"
+    );
+    let files = Files::new();
+    files.write("scene.toml", &whole);
+    let scene = files.load().unwrap().scene;
+    let rule = &scene.metric.classes[0];
+    assert_eq!(scene.metric.norm, crate::scene::Norm::Rms);
+    assert_eq!(scene.metric.weights.len(), scene.garment.positions.len());
+    assert!(
+        rule.vertices.len() > 16
+            && rule.vertices.iter().all(|v| {
+                scene.garment.positions[*v as usize].y > 1.19
+                    && (scene.metric.weights[*v as usize] - 2.0).abs() < 1e-6
+            })
+    );
+    assert_eq!((rule.joint, rule.implausible, rule.axis), (2, [0, 1], Vec3::Y));
+    assert!((rule.penalty_m - 0.5).abs() < 1e-6);
+    for (from, to, words) in [
+        ("region = \"top\"\njoint", "region = \"hem\"\njoint", ["class[0].region", "\"hem\""]),
+        ("joint = \"Head\"", "joint = \"Tail\"", ["class[0].joint", "Tail"]),
+        ("[\"down\", \"up\"]\npenalty", "[\"down\", \"off\"]\npenalty", ["implausible", "off"]),
+        ("[0.0, 2.0, 0.0]", "[0.0, 0.0, 0.0]", ["class[0].axis", "range"]),
+        ("weight = 2.0", "weight = -1.0", ["weights[0].weight", "range"]),
+        ("norm = \"rms\"", "norm = \"mean\"", ["norm", "mean"]),
+        ("{ loop_near = \"Head\" }", "{ near = \"Head\" }", ["garment.regions.top[0]", "within_m"]),
+    ] {
+        assert!(whole.contains(from), "{from}");
+        files.write("scene.toml", whole.replacen(from, to, 1));
+        files.refused("scene.toml", &words);
+    }
+    files.write("scene.toml", format!("{SCENE}[simulator]\ncommand = []\n"));
+    files.refused("scene.toml", &["simulator.command", "program"]);
+}

@@ -23,6 +23,8 @@ const STEP: u8 = 3;
 const STATE: u8 = 4;
 /// From the program: why this step cannot be simulated, as UTF-8 text.
 const FAILED: u8 = 5;
+/// A program may take so long to start, whatever the limit of a step.
+const START_TIMEOUT: Duration = Duration::from_secs(60);
 /// Bytes of text that are kept of an error.
 const TEXT_BYTES_MAX: usize = 4096;
 
@@ -70,7 +72,7 @@ impl Process {
         std::thread::spawn(move || read_all(stdout, limit, &read));
         let mut process = Self { child, requests, answers };
         process.send(HELLO, hello);
-        match process.receive(timeout)? {
+        match process.receive(timeout.max(START_TIMEOUT))? {
             (READY, _) => Ok(process),
             (FAILED, text) => Err(words(&text)),
             (kind, _) => Err(format!("answered hello with a message of kind {kind}")),

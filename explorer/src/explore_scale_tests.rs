@@ -1,0 +1,371 @@
+//! Explorations under stress: killed a hundred times, on a full disk, steered, certified, large.
+
+use std::io::BufRead;
+use std::process::{Command, Stdio};
+
+use cloth::Vec3;
+use rand_core::{Rng, SeedableRng};
+
+use super::*;
+use crate::certificate::{certify, replay};
+use crate::grow::archive::Archive;
+use crate::grow::policy::{WalkModel, visits};
+use crate::scene::ClassRule;
+
+const FRAMES: u64 = 1500;
+
+/// What a child of this test binary explores, when it is asked to.
+fn child_place(folder: &Path) -> Place {
+    let root = folder.join("store");
+    Place {
+        store: crate::pack::local_store(&root).unwrap(),
+        folder: Some(root),
+        key: SigningKey::from_seed(&[3; 32]),
+        work: folder.join("work"),
+    }
+}
+
+fn slow_scene() -> Scene {
+    let mut scene = toy_scene();
+    scene.exploration.publish_every_frames = 150;
+    scene
+}
+
+/// Not a test of its own: the process that the tests below start, kill and starve.
+#[test]
+fn child() {
+    let Some(folder) = std::env::var_os("TOILE_TEST_CHILD") else { return };
+    let options = ExploreOptions { workers: 2, keep_free_bytes: 0, ..options(FRAMES) };
+    let mut said = |progress: &Progress| println!("reported {}", progress.states);
+    let place = child_place(Path::new(&folder));
+    let (scene, toy) = (slow_scene(), Toy::new(150));
+    match block_on(super::super::explore(&scene, &toy, &place, &options, &mut said)) {
+        Ok(summary) => println!("ended {:?} at {}", summary.end, summary.simulated_frames),
+        Err(error) => println!("failed: {error}"),
+    }
+}
+
+fn start_child(folder: &Path, before: &str) -> std::process::Child {
+    let test = std::env::current_exe().unwrap();
+    let line = format!(
+        "{before} exec '{}' --exact explore::tests::scale::child --nocapture --test-threads=1",
+        test.display()
+    );
+    Command::new("sh")
+        .args(["-c", &line])
+        .env("TOILE_TEST_CHILD", folder)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap()
+}
+
+/// The largest number of states reported as done, and the last line.
+fn read_reports(child: &mut std::process::Child) -> (u64, String) {
+    let lines = std::io::BufReader::new(child.stdout.take().unwrap()).lines();
+    let (mut reported, mut last) = (0, String::new());
+    for line in lines.map_while(Result::ok) {
+        if let Some(states) = line.trim().strip_prefix("reported ") {
+            // The last line of a killed child may be cut.
+            reported = reported.max(states.parse().unwrap_or(0));
+        }
+        if line.starts_with("ended") || line.starts_with("failed") {
+            last = line;
+        }
+    }
+    (reported, last)
+}
+
+fn whole_run(folder: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
+    let options = ExploreOptions { keep_free_bytes: 0, ..options(FRAMES) };
+    let place = child_place(folder);
+    let (scene, toy, mut quiet) = (slow_scene(), Toy::new(150), |_: &Progress| {});
+    block_on(super::super::explore(&scene, &toy, &place, &options, &mut quiet)).unwrap();
+    durable(folder)
+}
+
+/// Everything but the count of CPU seconds.
+fn durable(folder: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
+    let mut files = tree(folder);
+    files.retain(|name, _| !name.ends_with("simulate_cpu_s"));
+    files
+}
+
+#[cfg(unix)]
+#[test]
+fn killed_a_hundred_times_it_loses_nothing_that_it_reported() {
+    let whole = tempfile::tempdir().unwrap();
+    let expected = whole_run(whole.path());
+    let folder = tempfile::tempdir().unwrap();
+    let mut random = rand_pcg::Pcg64Mcg::seed_from_u64(11);
+    let (mut kills, mut ends) = (0, 0);
+    while kills < 100 {
+        let mut child = start_child(folder.path(), "");
+        let patience = std::time::Duration::from_micros(4_000 + random.next_u64() % 60_000);
+        std::thread::sleep(patience);
+        let _ = child.kill();
+        let (reported, last) = read_reports(&mut child);
+        let _ = child.wait();
+        kills += 1;
+        if folder.path().join("work/journal").exists() {
+            let scene = slow_scene();
+            let work = Work::open(&folder.path().join("work"), &scene, false).unwrap();
+            assert!(work.graph().next_id().0 >= reported, "kill {kills}: {reported} reported");
+        }
+        if last.starts_with("ended Frames") {
+            // It got there before its kill: the rest of the kills hit another folder.
+            ends += 1;
+            assert!(durable(folder.path()) == expected);
+            std::fs::remove_dir_all(folder.path().join("work")).unwrap();
+            std::fs::remove_dir_all(folder.path().join("store")).unwrap();
+        }
+    }
+    let mut child = start_child(folder.path(), "");
+    let (_, last) = read_reports(&mut child);
+    child.wait().unwrap();
+    assert!(last.starts_with("ended Frames"), "{last} after {ends} ends");
+    assert!(durable(folder.path()) == expected);
+}
+
+#[cfg(unix)]
+#[test]
+fn a_disk_that_fills_up_ends_the_run_in_words_and_loses_nothing() {
+    let whole = tempfile::tempdir().unwrap();
+    let expected = whole_run(whole.path());
+    let folder = tempfile::tempdir().unwrap();
+    let mut failures = 0;
+    // No file may grow beyond so many blocks: writes fail as on a full disk.
+    for blocks in [8, 16, 32, 48, 64, 80] {
+        let limit = format!("trap '' XFSZ; ulimit -f {blocks};");
+        let mut child = start_child(folder.path(), &limit);
+        let (reported, last) = read_reports(&mut child);
+        child.wait().unwrap();
+        assert!(!last.is_empty(), "it ended in words at {blocks} blocks");
+        failures += u32::from(last.starts_with("failed"));
+        assert!(!last.contains("panicked"), "{last}");
+        if folder.path().join("work/journal").exists() {
+            let work = Work::open(&folder.path().join("work"), &slow_scene(), false).unwrap();
+            assert!(work.graph().next_id().0 >= reported);
+        }
+    }
+    assert!(failures >= 2, "{failures}");
+    let mut child = start_child(folder.path(), "");
+    let (_, last) = read_reports(&mut child);
+    child.wait().unwrap();
+    assert!(last.starts_with("ended Frames"), "{last}");
+    assert!(durable(folder.path()) == expected);
+}
+
+#[test]
+fn it_stops_short_of_a_full_disk_and_goes_on_when_there_is_room() {
+    let (scene, toy) = (toy_scene(), Toy::new(150));
+    let folder = tempfile::tempdir().unwrap();
+    let mut store = Memory::default();
+    let short = ExploreOptions { keep_free_bytes: u64::MAX / 2, ..options(100) };
+    let summary = explore(&scene, &toy, (folder.path(), &mut store), &short).unwrap();
+    if cfg!(unix) {
+        assert_eq!((summary.end, summary.simulated_frames), (End::Disk, 0));
+    }
+    let summary = explore(&scene, &toy, (folder.path(), &mut store), &options(100)).unwrap();
+    assert_eq!(summary.end, End::Frames);
+}
+
+#[test]
+fn every_merge_is_certified_and_replays_to_the_same_number() {
+    let (scene, toy) = (toy_scene(), Toy::new(150));
+    let folder = tempfile::tempdir().unwrap();
+    explore(&scene, &toy, (folder.path(), &mut Memory::default()), &options(400)).unwrap();
+    let archive = Archive::open(folder.path(), &scene).unwrap();
+    let walked = [(EdgeId(2), 77)].into_iter().collect();
+    let certificate = certify(&archive, &scene, archive.shown(), &walked);
+    let stats = archive.view(archive.shown()).stats();
+    assert_eq!(certificate.merges.len() as u64, stats.merges);
+    assert_eq!(certificate.worst_error_mm, 1e3 * f64::from(stats.worst_error_m));
+    let passed: f64 = certificate.merges.iter().map(|merge| merge.visits).sum();
+    assert!(passed > 0.0 && passed <= 1.0 + 1e-9, "{passed}");
+    assert!(certificate.merges.iter().all(|m| m.walked == if m.edge == 2 { 77 } else { 0 }));
+    let all = replay(&archive, &certificate, (&toy, 2), usize::MAX, &|_| {}).unwrap();
+    assert_eq!(all.replayed as usize, certificate.merges.len());
+    assert_eq!((all.largest_difference_mm, all.states_differing), (0.0, 0));
+    let some = replay(&archive, &certificate, (&toy, 1), 5, &|_| {}).unwrap();
+    assert_eq!(some.replayed, 5);
+    // Another simulator than the one on record is found out.
+    let other = replay(&archive, &certificate, (&Toy::new(149), 1), 20, &|_| {}).unwrap();
+    assert!(other.states_differing > 0 && other.largest_difference_mm > 0.0);
+}
+
+fn classes(scene: &mut Scene, penalty_m: f32) {
+    scene.metric.classes = vec![ClassRule {
+        name: "first".into(),
+        values: ["left".into(), "right".into()],
+        joint: 0,
+        vertices: vec![0],
+        axis: Vec3::X,
+        threshold_m: 0.0,
+        implausible: [0, 1],
+        penalty_m,
+    }];
+}
+
+#[test]
+fn implausible_merges_are_undone_first_and_errors_stay_free_of_the_penalty() {
+    let mut found = Vec::new();
+    for penalty_m in [0.0, 5.0] {
+        let mut scene = toy_scene();
+        classes(&mut scene, penalty_m);
+        let folder = tempfile::tempdir().unwrap();
+        let place = (folder.path(), &mut Memory::default());
+        let summary = explore(&scene, &Toy::new(200), place, &options(600)).unwrap();
+        assert_eq!(summary.classes.len(), 2, "{:?}", summary.classes);
+        assert!(summary.classes.iter().map(|c| c.states).sum::<u64>() == summary.states);
+        assert!(summary.worst_error_mm < 2000.0, "{}", summary.worst_error_mm);
+        let archive = Archive::open(folder.path(), &scene).unwrap();
+        let certificate = certify(&archive, &scene, archive.graph().commit(), &[].into());
+        let crossing = |m: &&crate::certificate::Merge| {
+            m.class == "first left" && m.target_class == "first right"
+        };
+        let merges: Vec<_> = certificate.merges.iter().filter(crossing).collect();
+        assert!(merges.iter().all(|m| m.penalty_mm == f64::from(penalty_m) * 1e3));
+        assert!(certificate.bifurcations.iter().all(|b| b.from != b.to));
+        assert!(certificate.bifurcations.iter().any(|b| b.crossings > 0 && !b.walks.is_empty()));
+        if penalty_m > 0.0 {
+            assert_eq!(summary.implausible_merges, merges.len() as u64);
+        }
+        found.push(merges.len());
+    }
+    assert!(found[1] <= found[0], "{found:?}");
+}
+
+/// The error that players of this model see on average (m).
+fn seen(folder: &Path, scene: &Scene, model: &WalkModel) -> f64 {
+    let archive = Archive::open(folder, scene).unwrap();
+    let visits = visits(archive.graph(), model, &[]);
+    let errors = archive.graph().queue().iter();
+    errors.map(|(state, error_m)| f64::from(error_m) * visits[state.index()]).sum()
+}
+
+#[test]
+fn what_players_walk_is_explored_first_and_one_cheat_changes_little() {
+    let scene = toy_scene();
+    let walk = |ways: &[(u32, u32)], count: u64| {
+        let edge = |(from, to): &(u32, u32)| {
+            let leads = |e: &EdgeId| scene.primary.edge(*e).to.0 == *to;
+            let edge = scene.primary.out_edges(protocol::PoseId(*from)).find(leads).unwrap();
+            (edge, count)
+        };
+        ways.iter().map(edge).collect::<Vec<_>>()
+    };
+    let honest = walk(&[(0, 1), (1, 2), (2, 0)], 900);
+    let absurd = [honest.clone(), walk(&[(4, 5), (3, 0)], u64::MAX / 4)].concat();
+    let run = |policy, batch: &[(EdgeId, u64)]| {
+        let folder = tempfile::tempdir().unwrap();
+        let counts = batch.iter().copied().collect();
+        let mut store = Memory { walked: vec![Walked { newest: 1, counts }], ..Memory::default() };
+        let options = ExploreOptions { policy, ..options(260) };
+        let place = (folder.path(), &mut store);
+        explore(&scene, &Toy::new(200), place, &options).unwrap();
+        folder
+    };
+    let mut model = WalkModel::uniform(&scene.primary);
+    model.add(&honest);
+    let seen = |folder: &tempfile::TempDir| seen(folder.path(), &scene, &model);
+    let greedy = seen(&run(Policy::Greedy, &honest));
+    let visited = run(Policy::Visited, &honest);
+    let cheated = run(Policy::Visited, &absurd);
+    let (steered, misled) = (seen(&visited), seen(&cheated));
+    println!("seen by players: greedy {greedy}, visited {steered}, with a cheat {misled}");
+    assert!(steered < greedy, "{steered} against {greedy}");
+    assert!(misled < 1.25 * steered + 1e-4, "{misled} against {steered}");
+    // The record holds what steered, so that a resumed run chooses the same.
+    let archive = Archive::open(visited.path(), &scene).unwrap();
+    assert_eq!(archive.ledger().steering().telemetry(), 1);
+    assert_eq!(archive.ledger().steering().policy(), Policy::Visited);
+    let summary = explore(
+        &scene,
+        &Toy::new(200),
+        (visited.path(), &mut Memory::default()),
+        &ExploreOptions { policy: Policy::Predictive, ..options(2000) },
+    )
+    .unwrap();
+    assert_eq!((summary.policy, summary.end), (Policy::Predictive, End::Frames));
+}
+
+#[test]
+fn a_clip_that_is_not_there_is_named_with_those_that_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = ExploreOptions { clips: vec!["tango".into()], ..options(10) };
+    let place = (folder.path(), &mut Memory::default());
+    let error = explore(&toy_scene(), &Toy::new(9), place, &options).unwrap_err().to_string();
+    assert!(error.contains("\"tango\"") && error.contains("toy"), "{error}");
+}
+
+#[test]
+fn it_stops_by_itself_at_the_error_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = ExploreOptions { error_m: Some(0.05), ..ExploreOptions::default() };
+    let place = (folder.path(), &mut Memory::default());
+    let summary = explore(&toy_scene(), &Toy::new(60), place, &options).unwrap();
+    assert_eq!(summary.end, End::Error);
+    assert!(summary.best_worst_error_mm <= 50.0, "{}", summary.best_worst_error_mm);
+}
+
+/// `cargo test --release -p explorer -- --ignored --nocapture very_large`; `TOILE_STATES` states
+/// (100,000 unless given) of a simulator that costs nothing.
+#[test]
+#[ignore = "takes a minute; prints times"]
+fn very_large_folders_are_resumed_quickly() {
+    let wanted = std::env::var("TOILE_STATES").map_or(100_000, |n| n.parse().unwrap());
+    let mut scene = toy_scene();
+    scene.exploration.depth_frames = 400;
+    scene.exploration.publish_every_frames = u64::MAX;
+    let folder = tempfile::tempdir().unwrap();
+    let options = ExploreOptions { paper: true, best_prefix_at_end: false, ..options(wanted) };
+    let clock = Instant::now();
+    let mut store = Memory::default();
+    let setup = Setup {
+        scene: &scene,
+        simulators: &Toy::new(200),
+        work: folder.path(),
+        folder: None,
+        options: &options,
+    };
+    let work = Work::open(folder.path(), &scene, true).unwrap();
+    let explored = block_on(run(setup, work, &mut store, &mut |_| {})).unwrap();
+    println!("{} states explored in {:.1} s", explored.states, clock.elapsed().as_secs_f64());
+    let size = |name| std::fs::metadata(folder.path().join(name)).unwrap().len();
+    println!(
+        "bytes a state: journal {:.1}, landmarks {:.1}",
+        size("journal") as f64 / explored.states as f64,
+        size("landmarks") as f64 / explored.states as f64
+    );
+    let before = resident_bytes();
+    let clock = Instant::now();
+    let work = Work::open(folder.path(), &scene, true).unwrap();
+    println!(
+        "resumed in {:.2} s; {:.0} bytes of memory a state",
+        clock.elapsed().as_secs_f64(),
+        resident_bytes().saturating_sub(before) as f64 / explored.states as f64
+    );
+    assert_eq!(work.graph().next_id().0, explored.states);
+    let clock = Instant::now();
+    let (_, states) = (0..200).fold((0u64, 0u64), |(sum, states), id| {
+        let id = StateId(id * explored.states / 200);
+        let state = work.states().read(id).unwrap();
+        let pose = work.graph().state(id).pose;
+        let known = work.graph().interior(pose);
+        let found = work.similar().nearest(work.states(), (&state, 0), known, f32::INFINITY);
+        (sum + found.unwrap().unwrap().target.0, states + known.len() as u64)
+    });
+    println!(
+        "a search among {} states takes {:.3} ms",
+        states / 200,
+        clock.elapsed().as_secs_f64() * 1e3 / 200.0
+    );
+}
+
+/// Memory of this process, where the system tells it.
+fn resident_bytes() -> u64 {
+    let text = std::fs::read_to_string("/proc/self/statm").unwrap_or_default();
+    let pages: u64 = text.split_whitespace().nth(1).and_then(|p| p.parse().ok()).unwrap_or(0);
+    pages * 4096
+}
