@@ -141,8 +141,10 @@ impl Surface {
         let away = point - nearest;
         let length = hit.distance2.sqrt();
         let side = if away.dot(pseudo) < 0.0 { -1.0 } else { 1.0 };
-        // Very near, the direction is rounding noise: the surface's own normal is better.
-        let normal = if length > 1e-4 { away * (side / length) } else { pseudo };
+        // Over a face, and very near, the surface's own normal is better: rounding leans the
+        // direction, and what slides along a leaning plane is pushed off and pulled on by turns.
+        let own = hit.on.feature == Feature::Face || length <= 1e-4;
+        let normal = if own { pseudo } else { away * (side / length) };
         Contact {
             triangle: hit.triangle,
             weights: hit.on.weights,

@@ -11,9 +11,6 @@ const KNOWN_MISSES: &[(&str, &str)] = &[
     // The linear solver's iterations end before a stiff panel, or a long strip, turns as one piece.
     ("A3", "error of the period"),
     ("A4", "error of the period"),
-    // Friction is linearised about the old slip: what speeds up is held back.
-    ("A10", "share of the speed"),
-    ("A10", "error of the acceleration"),
     // The linear solver stops before momentum is exact, and damping acts on turning too.
     ("A12", "linear momentum"),
     ("A12", "angular momentum"),

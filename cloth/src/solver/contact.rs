@@ -66,8 +66,10 @@ pub(crate) struct Friction {
     pub(crate) coefficient: f32,
     /// Normal force (N).
     pub(crate) load: f32,
-    /// Way that the vertex would go by its old velocity (m).
+    /// Way that the vertex would go by its velocity and gravity (m).
     pub(crate) way: Vec3A,
+    /// Of the vertex (kg).
+    pub(crate) mass: f32,
     /// Substep (s).
     pub(crate) dt: f32,
 }
@@ -190,8 +192,10 @@ impl Row {
         *force -= n * (STIFFNESS * self.gap(x + dx));
         let slip = |way: Vec3A| way - self.travel - n * n.dot(way - self.travel);
         let most = friction.coefficient * friction.load;
-        let old = slip(friction.way).length().max(STICK_M_S * friction.dt);
-        let drag = (most / old).min(STIFFNESS);
+        // Coulomb's force, linear in the slip that it leaves of a free one: taken against the old slip
+        // it would hold back whatever starts to slide.
+        let left = slip(friction.way).length() - most * friction.dt * friction.dt / friction.mass;
+        let drag = (most / left.max(STICK_M_S * friction.dt)).min(STIFFNESS);
         *diagonal += (Mat3A::IDENTITY - normal) * drag;
         *force -= slip(dx) * drag;
     }

@@ -387,17 +387,19 @@ impl Workspace {
     /// Rows and friction. Those of the first pass have been chosen by where vertices head; those
     /// of the second act where the first pass has led a vertex too near.
     fn add_contacts(&mut self, model: &Model, dt: f32, first: bool) {
+        let fall = Vec3A::from(model.environment.gravity) * (dt * dt);
         for i in 0..self.x.len() {
             if self.held[i] {
                 continue;
             }
-            let (x, at, way) = (self.x[i], self.x[i] + self.dx[i], self.v[i] * dt);
+            let (x, at, way) = (self.x[i], self.x[i] + self.dx[i], self.v[i] * dt + fall);
+            let mass = model.masses[i];
             let diagonal = &mut self.matrix.diagonal[i];
             let force = &mut self.scratch.residual[i];
             let mut add = |row: &Row, coefficient, load| {
                 let acts = row.kind == Kind::Plane && (first || row.gap(at) < 0.0);
                 if acts || row.kind == Kind::Held {
-                    let friction = Friction { coefficient, load, way, dt };
+                    let friction = Friction { coefficient, load, way, mass, dt };
                     row.add(x, Vec3A::ZERO, friction, diagonal, force);
                 }
             };
