@@ -146,6 +146,9 @@ pub struct Serve {
     /// Token that players must show [default: none needed].
     #[arg(long, env = "TOILE_TOKEN", hide_env_values = true)]
     pub token: Option<String>,
+    /// Token that lets a client tag merges for the explorer [default: nobody may].
+    #[arg(long, env = "TOILE_TAG_TOKEN", hide_env_values = true)]
+    pub tag_token: Option<String>,
     /// Where the server's certificate is kept [default: beside a local store].
     #[arg(long, value_name = "DIR")]
     pub identity: Option<PathBuf>,
@@ -198,6 +201,9 @@ pub struct View {
     /// Token that the server asks for.
     #[arg(long, env = "TOILE_TOKEN", hide_env_values = true)]
     pub token: Option<String>,
+    /// Token that lets the page tag merges for the explorer.
+    #[arg(long, env = "TOILE_TAG_TOKEN", hide_env_values = true)]
+    pub tag_token: Option<String>,
     /// Where the page is, on this machine only.
     #[arg(long, default_value = "127.0.0.1:0")]
     pub listen: SocketAddr,
@@ -345,6 +351,20 @@ pub enum SceneCommand {
         /// Where to write it (the format of `motion_graph.file`).
         #[arg(long, value_name = "FILE.json")]
         out: PathBuf,
+    },
+    /// How soon the motion graph answers a player's presses.
+    Answers {
+        /// Built-in scene or a scene file.
+        file: String,
+        /// Presses, each of another clip.
+        #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+        presses: u32,
+        /// Of the presses.
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
+        /// One JSON object on the last line of stdout.
+        #[arg(long)]
+        json: bool,
     },
     /// Draw the garment in the rest pose and the clips' poses as a contact sheet.
     Picture {

@@ -17,6 +17,9 @@ pub fn run(a: args::Scene) -> Result<()> {
     match a.command {
         args::SceneCommand::Check { file, json } => check(&file, json),
         args::SceneCommand::Graph { file, density, to, out } => graph(&file, density, &to, &out),
+        args::SceneCommand::Answers { file, presses, seed, json } => {
+            answers(&file, presses as usize, seed, json)
+        }
         args::SceneCommand::Picture { file, out } => {
             place::ensure_writable(&out)?;
             let scene = load(&file)?;
@@ -24,6 +27,23 @@ pub fn run(a: args::Scene) -> Result<()> {
                 .with_context(|| format!("writing {}", out.display()))
         }
     }
+}
+
+/// Plays seeded presses through the scene's graph.
+fn answers(file: &str, presses: usize, seed: u64, json: bool) -> Result<()> {
+    let chunk = explorer::pack::scene_chunk::scene_chunk(&load(file)?);
+    let scene = std::sync::Arc::new(client_lib::Scene::new(chunk)?);
+    let answers = crate::view::answers::rehearse(&scene, presses, seed);
+    if json {
+        return format::print_json(&answers);
+    }
+    for (what, times) in [("any clip", answers.all), ("locomotion", answers.locomotion)] {
+        println!(
+            "{what:10}  {} presses: median {:.2} s, 90 % within {:.2} s; begins after {:.2} s (median)",
+            times.presses, times.median_s, times.p90_s, times.begins_median_s
+        );
+    }
+    Ok(())
 }
 
 /// Loads a scene by name or file.

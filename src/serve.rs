@@ -20,6 +20,7 @@ pub fn run(a: args::Serve) -> Result<()> {
     let config = ServerConfig {
         http: Some(a.http),
         token: a.token,
+        tag_token: a.tag_token,
         ..ServerConfig::new(opened.store, a.listen, identity)
     };
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;

@@ -17,7 +17,7 @@ use crate::explore::{Stop, explore_blocking, line};
 use crate::live::Live;
 use crate::recall::Named;
 use crate::store::Opened;
-use crate::view::View;
+use crate::view::{self, View};
 use crate::{args, format, place, scene, store};
 
 /// Between two looks at how it goes.
@@ -56,8 +56,11 @@ pub fn run(a: &args::Up) -> Result<()> {
         .enable_all()
         .build()
         .context("starting the server's runtime")?;
+    // Whoever sees the page of this process may tag, nobody else.
+    let tag_token = view::secret();
     let config = ServerConfig {
         http: Some(a.http),
+        tag_token: Some(tag_token.clone()),
         ..ServerConfig::new(Arc::clone(&opened.store), a.listen, identity)
     };
     let server = runtime.block_on(Server::start(config)).context("starting the server")?;
@@ -73,7 +76,7 @@ pub fn run(a: &args::Up) -> Result<()> {
     let explorer = Explorer::start((scene, named), opened, work, options)?;
     let players = players(&server, a.players)?;
     let server_page = server.http_addr().map(|http| format!("http://{http}/"));
-    let view = View::start(client(&server), a.page, server_page)?;
+    let view = View::start(client(&server), Some(tag_token), a.page, server_page)?;
     if !a.json {
         println!("{}", view.url());
     }

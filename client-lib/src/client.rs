@@ -6,7 +6,8 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use protocol::{PublisherKey, VersionNumber};
+use protocol::message::TagOutcome;
+use protocol::{GarmentId, PublisherKey, StateId, VersionNumber};
 use tokio::sync::Notify;
 
 use crate::character::Character;
@@ -43,6 +44,8 @@ pub struct ClientConfig {
     pub horizon: Horizon,
     /// Spreads the reconnections of many clients; any number that differs between them.
     pub jitter_seed: u64,
+    /// The only version to play, for looking at what was; `None`: always the newest.
+    pub version: Option<VersionNumber>,
 }
 
 impl ClientConfig {
@@ -57,6 +60,7 @@ impl ClientConfig {
             cache_bytes: CACHE_BYTES_DEFAULT,
             horizon: Horizon::default(),
             jitter_seed: 0,
+            version: None,
         }
     }
 }
@@ -142,6 +146,9 @@ struct State {
     status: Status,
     stages: BTreeMap<String, Arc<Stage>>,
     answered: u64,
+    /// Tags to be set, and answers to those that were.
+    tags: Vec<(GarmentId, StateId)>,
+    tagged: Vec<(GarmentId, StateId, TagOutcome)>,
 }
 
 impl Shared {
@@ -168,6 +175,17 @@ impl Shared {
             state.answered = asked;
             self.changed.notify_all();
         }
+    }
+
+    /// Tags that were asked for since the last look.
+    pub fn take_tags(&self) -> Vec<(GarmentId, StateId)> {
+        std::mem::take(&mut self.lock().tags)
+    }
+
+    /// What became of a tag.
+    pub fn answer_tag(&self, garment: GarmentId, state: StateId, outcome: TagOutcome) {
+        self.lock().tagged.push((garment, state, outcome));
+        self.changed.notify_all();
     }
 
     /// Waits until `done` gives something, or the time is over.
@@ -263,6 +281,25 @@ impl Client {
     pub fn wait_version(&self, number: VersionNumber, timeout: Duration) -> bool {
         let done = |state: &State| (state.status.version >= Some(number)).then_some(());
         self.shared.wait(timeout, done).is_some()
+    }
+
+    /// Asks that the explorer simulate at a dead end next, and waits for the server's answer; `None`
+    /// where none came in time. Takes a token with that right. For tools, not for a frame loop.
+    pub fn wait_tagged(
+        &self,
+        garment: GarmentId,
+        state: StateId,
+        timeout: Duration,
+    ) -> Option<TagOutcome> {
+        let is_it =
+            move |tag: &&(GarmentId, StateId, TagOutcome)| (tag.0, tag.1) == (garment, state);
+        {
+            let mut shared = self.shared.lock();
+            shared.tagged.retain(|tag| !is_it(&tag));
+            shared.tags.push((garment, state));
+        }
+        self.shared.wake.notify_one();
+        self.shared.wait(timeout, |state| state.tagged.iter().find(is_it).map(|tag| tag.2))
     }
 
     /// How it goes.

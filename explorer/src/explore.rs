@@ -14,12 +14,13 @@ use crate::grow::graph::Graph;
 use crate::grow::job::{JOB_STATES_MAX, JobError};
 use crate::grow::ledger::Phase;
 use crate::grow::policy::Policy;
-use crate::grow::record::{PublishRecord, SteerRecord};
+use crate::grow::record::{PublishRecord, SteerRecord, TagRecord};
 use crate::grow::round::{self, Ended, RoundError};
 use crate::grow::work::{Work, WorkError};
 use crate::pack::{EncodeSettings, PublishError, Publisher, collect_leftovers};
 use crate::scene::Scene;
 use crate::simulator::{SimulateError, Simulator, SimulatorFactory};
+use crate::tags::{Tagged, tagged_since};
 use crate::telemetry::{Walked, walked_since};
 use crate::view::GraphView;
 
@@ -176,6 +177,9 @@ trait Publish {
 
     /// What players walked since this batch of telemetry.
     async fn walked(&self, after: u64) -> Result<Walked, object_store::Error>;
+
+    /// What people pointed at since this tag.
+    async fn tagged(&self, after: u64) -> Result<Tagged, object_store::Error>;
 }
 
 /// The store's publisher, for the garment of this name.
@@ -197,6 +201,13 @@ impl Publish for Garment<'_> {
         match self.0.head().and_then(|head| head.garment(self.1)) {
             Some(garment) => walked_since(self.2, garment.id, after).await,
             None => Ok(Walked { newest: after, ..Walked::default() }),
+        }
+    }
+
+    async fn tagged(&self, after: u64) -> Result<Tagged, object_store::Error> {
+        match self.0.head().and_then(|head| head.garment(self.1)) {
+            Some(garment) => tagged_since(self.2, garment.id, after).await,
+            None => Ok(Tagged { newest: after, ..Tagged::default() }),
         }
     }
 }
@@ -333,6 +344,14 @@ async fn steer(
         let counts = walked.counts.into_iter().collect();
         work.steer(SteerRecord { policy, clips, telemetry, counts })?;
     }
+    let known = work.ledger().newest_tag();
+    let Tagged { newest, states } = publisher.tagged(known).await.unwrap_or_else(|error| {
+        tracing::warn!(%error, "tags cannot be read; exploring goes on");
+        Tagged { newest: known, states: Vec::new() }
+    });
+    if newest != known {
+        work.tag(TagRecord { newest, states })?;
+    }
     Ok(())
 }
 
@@ -349,6 +368,8 @@ fn due(work: &Work, every: u64) -> bool {
     let frames_at = |commit: u64| work.graph().moments()[commit as usize].states - 1;
     match work.ledger().published() {
         None => true,
+        // Whoever tagged a merge waits for what came of it.
+        Some(last) if work.ledger().is_round_of_tags() => last.commit != work.graph().commit(),
         Some(last) => work.graph().simulated_frames() / every > frames_at(last.commit) / every,
     }
 }

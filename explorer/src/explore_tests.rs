@@ -27,6 +27,8 @@ struct Memory {
     versions: Vec<Version>,
     /// What players walked, as batches.
     walked: Vec<Walked>,
+    /// What people pointed at, in order.
+    tags: Vec<StateId>,
 }
 
 impl Publish for Memory {
@@ -50,6 +52,11 @@ impl Publish for Memory {
             self.versions.push(version);
         }
         Ok(VersionNumber(self.versions.len() as u64))
+    }
+
+    async fn tagged(&self, after: u64) -> Result<Tagged, object_store::Error> {
+        let states = self.tags.iter().skip(after as usize).copied().collect();
+        Ok(Tagged { newest: after.max(self.tags.len() as u64), states })
     }
 
     async fn walked(&self, after: u64) -> Result<Walked, object_store::Error> {
@@ -430,6 +437,39 @@ fn the_published_store_is_equal_for_any_workers_and_after_any_stop() {
         assert!(expected.keys().eq(found.keys()), "{workers} workers, {patience}");
         assert!(*expected == found, "{workers} workers, {patience}");
     }
+}
+
+/// The dead end with the smallest error is tagged: it is simulated next, alone, and shown at once; a
+/// run that was killed after it goes on to the same bytes.
+#[test]
+fn what_people_point_at_is_simulated_next_and_shown_at_once() {
+    let (scene, toy) = (toy_scene(), Toy::new(150));
+    let folder = tempfile::tempdir().unwrap();
+    let mut store = Memory::default();
+    let place = (folder.path(), &mut store);
+    explore(&scene, &toy, place, &options(60)).unwrap();
+    let work = Work::open(folder.path(), &scene, false).unwrap();
+    let (least, _) = work.graph().queue().iter().last().unwrap();
+    let frames = work.graph().simulated_frames();
+    drop(work);
+    let before = store.versions.len();
+    // One that was never a dead end, and one that is none of this graph, cost nothing.
+    store.tags = vec![StateId(0), least, StateId(1 << 40), least];
+    let mut versions = Vec::new();
+    let options = ExploreOptions { best_prefix_at_end: false, ..options(frames + 1) };
+    explore(&scene, &toy, (folder.path(), &mut store), &options).unwrap();
+    versions.extend_from_slice(&store.versions[before..]);
+    let is_simulated =
+        |version: &Version| matches!(version.links[least.index()], LinkEntry::Interior { .. });
+    assert!(is_simulated(&versions[0]), "the first version after the tag shows it");
+    let [journal, states] = files(folder.path());
+    let again = tempfile::tempdir().unwrap();
+    for (name, bytes) in [("journal", &journal), ("states", &states)] {
+        std::fs::write(again.path().join(name), bytes).unwrap();
+    }
+    let reopened = Work::open(again.path(), &scene, false).unwrap();
+    assert_eq!(reopened.ledger().newest_tag(), 4);
+    assert!(reopened.graph().queue().iter().all(|(state, _)| state != least));
 }
 
 #[path = "explore_scale_tests.rs"]

@@ -24,6 +24,7 @@ pub mod primary;
 pub mod scene;
 pub mod simulate;
 pub mod simulator;
+pub mod tags;
 pub mod telemetry;
 pub mod view;
 pub mod watchdog;

@@ -36,6 +36,7 @@ pub mod session;
 pub mod sign;
 pub mod store;
 pub mod table;
+pub mod tag;
 pub mod telemetry;
 mod wire;
 

@@ -46,6 +46,10 @@ pub const TELEMETRY_EDGES_MAX: usize = 4096;
 pub const TRAVERSALS_PER_SECOND_MAX: u32 = 240;
 /// Traversals that a client may save up while it is silent.
 pub const TRAVERSALS_BURST_MAX: u32 = 60 * TRAVERSALS_PER_SECOND_MAX;
+/// Tags per second that a server takes from one client, and how many it may save up.
+pub const TAGS_PER_SECOND_MAX: u32 = 2;
+/// See [`TAGS_PER_SECOND_MAX`].
+pub const TAGS_BURST_MAX: u32 = 60;
 /// Messages per second that a server accepts from one client; a client keeps to half of it.
 pub const MESSAGES_PER_SECOND_MAX: u32 = 4000;
 /// Fetches under way that a server accepts from one client.

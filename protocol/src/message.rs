@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ChunkHash, EdgeId, GarmentId, VersionNumber};
+use crate::ids::{ChunkHash, EdgeId, GarmentId, StateId, VersionNumber};
 use crate::limits;
 use crate::sign::PublisherKey;
 use crate::wire::{DecodeError, at_most, ensure, parse};
@@ -96,6 +96,36 @@ pub enum ClientMessage {
     Telemetry(Telemetry),
     /// Ends the conversation.
     Bye,
+    /// From now on this version only, whatever the head is: for looking at what was.
+    Pin {
+        /// Its number.
+        version: VersionNumber,
+    },
+    /// The explorer should simulate at this dead end next. Takes a token with that right.
+    Tag {
+        /// The garment.
+        garment: GarmentId,
+        /// The dead end.
+        state: StateId,
+    },
+}
+
+/// What became of a tag.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum TagOutcome {
+    /// It is in the store, under this number.
+    Kept {
+        /// See [`store::tag_path`](crate::store::tag_path).
+        number: u64,
+    },
+    /// The client's token does not allow it.
+    NotAllowed,
+    /// The head has no such garment or state.
+    Unknown,
+    /// More tags than one client may set.
+    TooMany,
+    /// The store could not be written; try again.
+    Failed,
 }
 
 /// From server to client.
@@ -128,6 +158,15 @@ pub enum ServerMessage {
         code: CloseCode,
         /// The same for people.
         message: String,
+    },
+    /// Answers a tag.
+    Tagged {
+        /// The garment.
+        garment: GarmentId,
+        /// The dead end.
+        state: StateId,
+        /// What became of it.
+        outcome: TagOutcome,
     },
 }
 
@@ -216,7 +255,14 @@ impl ClientMessage {
                 let stray = telemetry.edges.iter().find(|e| e.0.index() >= limits::EDGES_MAX);
                 ensure(stray.is_none(), || format!("edge {stray:?} is out of range"))
             }
-            Self::Fetch { .. } | Self::Cancel { .. } | Self::Applied { .. } | Self::Bye => Ok(()),
+            Self::Tag { state, .. } => {
+                ensure(state.0 < limits::STATES_MAX, || format!("state {state} is out of range"))
+            }
+            Self::Fetch { .. }
+            | Self::Cancel { .. }
+            | Self::Applied { .. }
+            | Self::Bye
+            | Self::Pin { .. } => Ok(()),
         }
     }
 }

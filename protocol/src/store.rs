@@ -10,6 +10,8 @@ pub const VERSIONS: &str = "versions";
 pub const PUBLISHER: &str = "publisher.pub";
 /// Folder of telemetry batches.
 pub const TELEMETRY: &str = "telemetry";
+/// Folder of tags.
+pub const TAGS: &str = "tags";
 
 /// `chunks/ab/abcdef...`: the first byte spreads the load over folders.
 pub fn chunk_path(hash: &ChunkHash) -> String {
@@ -25,6 +27,17 @@ pub fn version_path(number: VersionNumber) -> String {
 /// `telemetry/00000000000000000001`: a [`TelemetryBatch`](crate::telemetry::TelemetryBatch).
 pub fn telemetry_path(number: u64) -> String {
     format!("{TELEMETRY}/{number:020}")
+}
+
+/// `tags/00000000000000000001`: a [`Tag`](crate::tag::Tag). Numbers begin at 1 and leave none out, so
+/// that a reader who knows how far it has read needs no listing.
+pub fn tag_path(number: u64) -> String {
+    format!("{TAGS}/{number:020}")
+}
+
+/// The number in a tag's path, or `None` for another file.
+pub fn tag_of_path(path: &str) -> Option<u64> {
+    numbered(path, TAGS)
 }
 
 /// The number in a telemetry batch's path, or `None` for another file.

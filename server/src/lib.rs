@@ -9,7 +9,7 @@
 //!
 //! Map: `store` reading, verified; `versions` notices new ones; `quic` the endpoint; `session` one
 //! player; `http` health, metrics, status, chunks, the live page; `telemetry` counts into the
-//! store; `identity` the certificate; `socket` counts stray datagrams.
+//! store; `tags` too; `identity` the certificate; `socket` counts stray datagrams.
 //!
 //! ```no_run
 //! # async fn run() -> Result<(), Box<dyn std::error::Error>> {
@@ -34,6 +34,7 @@ mod shared;
 mod socket;
 mod stats;
 mod store;
+mod tags;
 mod telemetry;
 mod versions;
 
@@ -66,6 +67,8 @@ pub struct ServerConfig {
     pub http: Option<SocketAddr>,
     /// What every client must show; `None`: nothing.
     pub token: Option<String>,
+    /// What a client shows instead to be allowed to set tags; `None`: nobody may.
+    pub tag_token: Option<String>,
     /// Folder of the certificate, made on first start.
     pub identity_dir: PathBuf,
     /// Players at the same time. Default 1,000: at a few hundred kilobytes of buffers each they
@@ -88,6 +91,7 @@ impl ServerConfig {
             listen,
             http: None,
             token: None,
+            tag_token: None,
             identity_dir,
             players_max: 1000,
             cache_bytes_max: 256 << 20,
@@ -149,6 +153,7 @@ impl Server {
         let http_addr = listener.as_ref().and_then(|listener| listener.local_addr().ok());
         let shared = Arc::new(Shared {
             token: config.token,
+            tag_token: config.tag_token,
             players_max: config.players_max,
             fingerprint: identity.fingerprint(),
             started: Instant::now(),

@@ -6,15 +6,16 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use protocol::frame::chunk_head;
-use protocol::message::{CloseCode, Priority, Telemetry};
+use protocol::message::{CloseCode, Priority, TagOutcome, Telemetry};
 use protocol::session::{Server as Machine, ServerConfig, ServerEvent};
-use protocol::{ChunkHash, SignedManifest, VersionNumber, limits};
+use protocol::{ChunkHash, GarmentId, SignedManifest, StateId, VersionNumber, limits};
 use quinn::{Connection, RecvStream, SendStream, VarInt};
 use tokio::sync::oneshot;
 use tokio::task::JoinSet;
 
 use crate::shared::{Head, Shared, lock};
 use crate::store::ReadError;
+use crate::tags;
 
 /// Chunks sent at the same time to one player; what is urgent gets a few more places.
 const SENDS_MAX: usize = 16;
@@ -37,7 +38,8 @@ pub(crate) async fn serve(shared: Arc<Shared>, connection: Connection) {
     let Ok((control, messages)) = streams else { return };
     // Control overtakes every chunk.
     let _ = control.set_priority(i32::MAX);
-    let machine = Machine::new(ServerConfig { token: shared.token.clone() }, shared.now());
+    let (token, tag_token) = (shared.token.clone(), shared.tag_token.clone());
+    let machine = Machine::new(ServerConfig { token, tag_token }, shared.now());
     let session = Session {
         shared,
         connection,
@@ -77,6 +79,8 @@ struct Sending {
 
 enum Done {
     Base(Option<Arc<SignedManifest>>),
+    Pinned(VersionNumber, Option<Arc<SignedManifest>>),
+    Tagged(GarmentId, StateId, TagOutcome),
     Chunk { hash: ChunkHash, serial: u64, found: bool },
 }
 
@@ -144,6 +148,14 @@ impl Session {
         match event {
             ServerEvent::Open { .. } => self.let_in(),
             ServerEvent::Base(number) => self.find_base(number),
+            ServerEvent::Pin(number) => self.find_pinned(number),
+            ServerEvent::Tag { garment, state } => {
+                let shared = self.shared.clone();
+                self.tasks.spawn(async move {
+                    let outcome = tags::keep(&shared, garment, state).await;
+                    Done::Tagged(garment, state, outcome)
+                });
+            }
             ServerEvent::Send { hash, priority } => {
                 self.waiting.retain(|(_, _, waiting)| *waiting != hash);
                 if !self.sending.contains_key(&hash) {
@@ -202,6 +214,17 @@ impl Session {
         });
     }
 
+    fn find_pinned(&mut self, number: VersionNumber) {
+        let Some(publisher) = self.shared.head.borrow().publisher else {
+            return self.machine.handle_pinned(number, None);
+        };
+        let shared = self.shared.clone();
+        self.tasks.spawn(async move {
+            let found = shared.source.version(number, &publisher).await;
+            Done::Pinned(number, found.ok().flatten())
+        });
+    }
+
     fn start_sends(&mut self) {
         while let Some(&(priority, serial, hash)) = self.waiting.first() {
             let is_urgent = priority <= Priority::Urgent;
@@ -223,6 +246,10 @@ impl Session {
     fn finish(&mut self, done: Done) {
         match done {
             Done::Base(manifest) => self.machine.handle_base(manifest),
+            Done::Pinned(number, manifest) => self.machine.handle_pinned(number, manifest),
+            Done::Tagged(garment, state, outcome) => {
+                self.machine.handle_tagged(garment, state, outcome);
+            }
             Done::Chunk { hash, serial, found } => {
                 // A cancelled chunk may be on its way a second time already.
                 if self.sending.get(&hash).is_some_and(|sending| sending.serial == serial) {

@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use protocol::session::Time;
-use protocol::{GarmentId, PublisherKey, SignedManifest, VersionNumber};
+use protocol::{GarmentId, PublisherKey, SignedManifest, StateId, VersionNumber};
 use std::sync::Arc;
 use tokio::sync::{Notify, watch};
 
@@ -20,6 +20,7 @@ const HISTORY_MAX: usize = 2000;
 #[derive(Debug)]
 pub(crate) struct Shared {
     pub token: Option<String>,
+    pub tag_token: Option<String>,
     pub players_max: usize,
     pub fingerprint: String,
     pub started: Instant,
@@ -71,6 +72,14 @@ impl Shared {
         let head = self.head.borrow();
         let garments = &head.signed.as_ref()?.manifest.garments;
         garments.iter().find(|known| known.id == garment).map(|known| known.stats.edges)
+    }
+
+    /// Whether the head has a garment with such a state, and the head's number.
+    pub fn has_state(&self, garment: GarmentId, state: StateId) -> Option<VersionNumber> {
+        let head = self.head.borrow();
+        let manifest = &head.signed.as_ref()?.manifest;
+        let found = manifest.garments.iter().find(|known| known.id == garment)?;
+        (state.0 < found.stats.states).then_some(manifest.number)
     }
 
     pub fn stats(&self) -> Stats {

@@ -88,9 +88,23 @@ impl Source {
         Ok(paths.iter().filter_map(|path| store::telemetry_of_path(path)).max().unwrap_or(0))
     }
 
+    /// The newest tag, 0 for none.
+    pub async fn newest_tag(&self) -> Result<u64, ReadError> {
+        let paths = self.paths(store::TAGS, None).await?;
+        Ok(paths.iter().filter_map(|path| store::tag_of_path(path)).max().unwrap_or(0))
+    }
+
+    /// Creates a tag; `false` if that number is taken.
+    pub async fn create_tag(&self, number: u64, bytes: Vec<u8>) -> Result<bool, ReadError> {
+        self.create(store::tag_path(number), bytes).await
+    }
+
     /// Creates a batch of telemetry; `false` if that number is taken.
     pub async fn create_telemetry(&self, number: u64, bytes: Vec<u8>) -> Result<bool, ReadError> {
-        let path = store::telemetry_path(number);
+        self.create(store::telemetry_path(number), bytes).await
+    }
+
+    async fn create(&self, path: String, bytes: Vec<u8>) -> Result<bool, ReadError> {
         let options = PutOptions::from(PutMode::Create);
         match self.store.put_opts(&Path::from(&*path), bytes.into(), options).await {
             Ok(_) => Ok(true),

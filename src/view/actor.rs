@@ -96,7 +96,8 @@ impl Actor {
         let scene = character.version().scene();
         scene.skeleton().world(&character.world_pose(), &mut self.joints);
         let hips = character.placement();
-        self.plain = Skinned::bind(scene, &hips, &self.joints, &self.positions);
+        let triangles = &character.version().mesh().triangles;
+        self.plain = Skinned::bind(scene, (&hips, &self.joints), &self.positions, triangles);
         Ok(())
     }
 

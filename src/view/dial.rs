@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use anyhow::Result;
-use client_lib::{Character, PoseId};
+use client_lib::{Character, Histogram, PoseId};
 use serde::Serialize;
 
 /// States on which the error of leaving columns out is measured, spread over the poses.
@@ -20,7 +20,7 @@ pub struct Point {
     pub max_mm: f32,
     /// Root mean square of the same (mm).
     pub rms_mm: f32,
-    /// Time of decoding one frame (ms).
+    /// Median time of decoding one frame (ms).
     pub decode_ms: f64,
     /// Coefficients as they are stored, at the scene's rate (kB/s).
     pub kb_s: f64,
@@ -49,12 +49,13 @@ pub fn curve(character: &Character) -> Result<Vec<Point>> {
     let (mut full, mut part) = (vec![0.0f32; rows], vec![0.0f32; rows]);
     let mut points = Vec::new();
     for columns in RANKS.into_iter().filter(|rank| *rank < all).chain([all]) {
-        let (mut max, mut sum, mut vertices, mut spent_s) = (0.0f32, 0.0f64, 0usize, 0.0f64);
+        let (mut max, mut sum, mut vertices) = (0.0f32, 0.0f64, 0usize);
+        let mut spent_ms = Histogram::default();
         for coefficients in &states {
             basis.reconstruct(coefficients, 0..rows, all, &mut full)?;
             let start = Instant::now();
             basis.reconstruct(coefficients, 0..rows, columns, &mut part)?;
-            spent_s += start.elapsed().as_secs_f64();
+            spent_ms.record(start.elapsed().as_secs_f64() * 1e3);
             let ((full, _), (part, _)) = (full.as_chunks::<3>(), part.as_chunks::<3>());
             for (a, b) in full.iter().zip(part) {
                 let square: f32 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
@@ -68,7 +69,7 @@ pub fn curve(character: &Character) -> Result<Vec<Point>> {
             columns,
             max_mm: max.sqrt() * 1e3,
             rms_mm: (sum / vertices.max(1) as f64).sqrt() as f32 * 1e3,
-            decode_ms: spent_s * 1e3 / states.len().max(1) as f64,
+            decode_ms: spent_ms.percentile(0.5),
             kb_s: state_bytes * share * f64::from(scene.fps()) / 1e3,
         });
     }

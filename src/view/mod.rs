@@ -4,6 +4,7 @@
 //! quantised to 16 bits, and draws them.
 
 mod actor;
+pub mod answers;
 mod app;
 mod dial;
 mod http;
@@ -19,7 +20,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use client_lib::{Client, ClientConfig};
+use client_lib::ClientConfig;
 use server::{Server, ServerConfig};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
@@ -43,12 +44,14 @@ pub struct View {
 }
 
 impl View {
-    /// Connects to a server and serves the page at `listen`.
+    /// Connects to a server and serves the page at `listen`. With a token for tags the page may set
+    /// some.
     ///
     /// # Errors
     /// An address that is not this machine's own, or is taken; a fingerprint that cannot be read.
     pub fn start(
         client: ClientConfig,
+        tag_token: Option<String>,
         listen: SocketAddr,
         server_page: Option<String>,
     ) -> Result<Self> {
@@ -66,7 +69,10 @@ impl View {
             .block_on(TcpListener::bind(listen))
             .with_context(|| format!("the page cannot listen on {listen}; choose another port"))?;
         let address = listener.local_addr()?;
-        let app = Arc::new(App::new(Client::connect(client)?, server_page));
+        let may_tag = tag_token.is_some();
+        let token = tag_token.or(client.token.clone());
+        let app = App::new(ClientConfig { token, ..client }, server_page, may_tag)?;
+        let app = Arc::new(app);
         let (stop, mut stopped) = watch::channel(false);
         let stops = async move { drop(stopped.wait_for(|stop| *stop).await) };
         runtime.spawn(http::serve(Arc::clone(&app), listener, stops));
@@ -96,6 +102,7 @@ impl Drop for View {
 /// Shows a served world, or a store by serving it, until Ctrl-C.
 pub fn run(a: &args::View) -> Result<()> {
     let stop = Stop::on_signals()?;
+    let mut tag_token = a.tag_token.clone();
     let (config, serving) = match (&a.connect, &a.store) {
         (Some(address), _) => {
             let config = ClientConfig {
@@ -106,13 +113,14 @@ pub fn run(a: &args::View) -> Result<()> {
             (config, None)
         }
         (None, Some(text)) => {
-            let serving = Serving::start(text)?;
+            let own = tag_token.get_or_insert_with(secret).clone();
+            let serving = Serving::start(text, own)?;
             (serving.client(), Some(serving))
         }
         (None, None) => anyhow::bail!("name a server (--connect ADDRESS) or a store to show"),
     };
     let server_page = serving.as_ref().and_then(Serving::page);
-    let view = View::start(config, a.listen, server_page)?;
+    let view = View::start(config, tag_token, a.listen, server_page)?;
     println!("{}", view.url());
     let mut pages = 0;
     while !stop.is_asked() {
@@ -129,6 +137,13 @@ pub fn run(a: &args::View) -> Result<()> {
     Ok(())
 }
 
+/// A token that nobody outside this process knows.
+pub fn secret() -> String {
+    use std::hash::{BuildHasher, RandomState};
+    // Each state is keyed by the system's randomness.
+    (0..4u8).map(|part| format!("{:016x}", RandomState::new().hash_one(part))).collect()
+}
+
 /// A server of our own, for a store.
 struct Serving {
     server: Server,
@@ -136,7 +151,7 @@ struct Serving {
 }
 
 impl Serving {
-    fn start(text: &str) -> Result<Self> {
+    fn start(text: &str, tag_token: String) -> Result<Self> {
         let opened = store::open_store(text)?;
         let identity = place::identity(&opened, None)?;
         let any: SocketAddr = ([127, 0, 0, 1], 0).into();
@@ -145,8 +160,11 @@ impl Serving {
             .enable_all()
             .build()
             .context("starting the server's runtime")?;
-        let config =
-            ServerConfig { http: Some(any), ..ServerConfig::new(opened.store, any, identity) };
+        let config = ServerConfig {
+            http: Some(any),
+            tag_token: Some(tag_token),
+            ..ServerConfig::new(opened.store, any, identity)
+        };
         let server = runtime.block_on(Server::start(config)).context("starting the server")?;
         Ok(Self { server, runtime })
     }

@@ -4,12 +4,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use client_lib::{Character, Histogram, StateId, StepOutcome};
+use client_lib::{Character, Client, Histogram, StateId, StepOutcome};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::actor::{Actor, Blending, Still, Tint};
+use super::answers;
 use super::app::App;
 use super::dial;
 use super::steering::Steering;
@@ -24,6 +25,8 @@ const REPORT: Duration = Duration::from_millis(250);
 pub const PANES_MAX: usize = 4;
 /// Characters in a crowd.
 pub const CROWD_MAX: usize = 100;
+/// Seeded presses by which the page says how soon the graph answers.
+const PRESSES: usize = 200;
 /// Merges passed that wait for the next report.
 const PASSED_MAX: usize = 200;
 /// Room for a character in a crowd (m).
@@ -65,6 +68,11 @@ pub enum Command {
         /// How many.
         count: usize,
     },
+    /// Ask the explorer to simulate at a merge next.
+    Tag {
+        /// Its dead end.
+        dead_end: u64,
+    },
 }
 
 /// What one pane of a comparison shows.
@@ -73,6 +81,8 @@ pub enum Command {
 pub struct Pane {
     /// Skin the cloth to the body instead.
     plain: bool,
+    /// A version by number; none: the current one.
+    version: Option<u64>,
     /// Columns of the basis; none: as the dial says.
     columns: Option<usize>,
     /// How merges are blended.
@@ -96,6 +106,8 @@ pub struct Show {
     actors: Vec<Actor>,
     steering: Option<Steering>,
     survey: Option<Survey>,
+    /// Connections of panes that play older versions.
+    older: Vec<Arc<Client>>,
     fixed_columns: Vec<Option<usize>>,
     curve: Vec<dial::Point>,
     dial_mm: f32,
@@ -119,7 +131,8 @@ struct Clock {
 struct Figures {
     reported: Option<Instant>,
     decode_us: Histogram,
-    frame_us: Histogram,
+    /// Decoding, skinning, normals and quantising, per character.
+    write_us: Histogram,
     steps: [u64; 3],
     passed: Vec<Passing>,
     seed: u64,
@@ -154,6 +167,7 @@ impl Show {
             actors: Vec::new(),
             steering: None,
             survey: None,
+            older: Vec::new(),
             fixed_columns: Vec::new(),
             curve: Vec::new(),
             dial_mm: 0.0,
@@ -180,14 +194,14 @@ impl Show {
         }
         self.advance()?;
         self.take_version(&mut said)?;
-        let start = Instant::now();
         let phase = self.clock.ticks.fract() as f32;
         self.writer.begin();
         for actor in &mut self.actors {
+            let start = Instant::now();
             actor.write(phase, &mut self.figures.decode_us, &mut self.writer)?;
+            self.figures.write_us.record(start.elapsed().as_secs_f64() * 1e6);
         }
         said.push(Said::Bytes(self.writer.end()));
-        self.figures.frame_us.record(start.elapsed().as_secs_f64() * 1e6);
         if self.figures.reported.is_none_or(|at| at.elapsed() >= REPORT) {
             said.push(Said::Text(self.report()));
         }
@@ -218,6 +232,7 @@ impl Show {
             Command::Compare { panes } => self.arrange(Mode::Compare(panes))?,
             Command::Crowd { count } => self.crowd(count)?,
             Command::Inspect { dead_end } => return self.inspect(dead_end).map(Some),
+            Command::Tag { dead_end } => self.tag(dead_end)?,
         }
         Ok(None)
     }
@@ -310,8 +325,9 @@ impl Show {
             "vertices": version.mesh().vertex_count, "fps": scene.fps(), "clips": scene.clips(),
             "poses": scene.pose_count(), "edges": scene.edges().len(),
             "states": version.links().state_count(), "columns": version.basis().columns(),
+            "rehearsed": answers::rehearse(scene, PRESSES, 1),
             "merges": survey.merges(), "worst": survey.worst(), "curve": self.curve,
-            "server_page": self.app.server_page,
+            "server_page": self.app.server_page, "may_tag": self.app.may_tag(),
             "stats": { "worst_mm": version.listing().stats.worst_error_m * 1e3,
                 "mean_mm": version.listing().stats.mean_error_m * 1e3,
                 "codec_max_mm": version.listing().stats.codec_max_error_m * 1e3 },
@@ -345,10 +361,18 @@ impl Show {
         };
         ensure!(!panes.is_empty() && panes.len() <= PANES_MAX, "1 to {PANES_MAX} panes");
         let mut actors = Vec::new();
+        let mut older = Vec::new();
         for (index, pane) in panes.iter().enumerate() {
-            let character = self.app.client.character(self.app.garment())?;
+            let character = match pane.version {
+                None => self.app.client.character(self.app.garment())?,
+                Some(number) => {
+                    let client = self.app.pinned(number)?;
+                    older.push(Arc::clone(&client));
+                    client.character(self.app.garment())?
+                }
+            };
             let mut actor = Actor::new(character, index as u32);
-            actor.character.set_counted(index == 0);
+            actor.character.set_counted(index == 0 && pane.version.is_none());
             actor.character.set_blend(pane.blend.into());
             if pane.plain {
                 actor.be_plain()?;
@@ -357,10 +381,23 @@ impl Show {
             actors.push(actor);
         }
         self.actors = actors;
+        self.older = older;
         self.fixed_columns = panes.iter().map(|pane| pane.columns.map(|n| n.max(1))).collect();
         self.mode = mode;
         self.set_columns();
         Ok(())
+    }
+
+    /// Asks for a simulation at a merge, and keeps an eye on the walk around it.
+    fn tag(&mut self, dead_end: u64) -> Result<()> {
+        let survey = self.survey.as_ref().context("nothing is played yet")?;
+        let lead = self.actors.first().context("nothing is played yet")?;
+        let dead_end = StateId(dead_end);
+        ensure!(survey.merge(dead_end).is_some(), "state {dead_end} is merged no more");
+        let around = survey.around(dead_end);
+        let around = around.with_context(|| format!("no way leads to state {dead_end}"))?;
+        let first_mm = survey.worst_on(&around);
+        self.app.tag(lead.character.version().garment(), around, first_mm)
     }
 
     fn crowd(&mut self, count: usize) -> Result<()> {
@@ -451,12 +488,13 @@ impl Show {
             "resident_bytes": status.resident_bytes(),
             "basis_bytes": status.memory.basis,
             "decode_us": figures.decode_us.percentile(0.5),
-            "frame_us": figures.frame_us.percentile(0.5),
+            "write_us": figures.write_us.percentile(0.5),
             "characters": self.actors.len(),
             "columns": self.actors[0].columns.min(lead.version().basis().columns()),
+            "tags": self.app.tags(self.survey.as_ref()),
         });
         figures.decode_us = Histogram::default();
-        figures.frame_us = Histogram::default();
+        figures.write_us = Histogram::default();
         report
     }
 }

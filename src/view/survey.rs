@@ -11,7 +11,7 @@ use serde::Serialize;
 const WORST: usize = 40;
 /// Frames of a loop before the merge and after it.
 const BEFORE: usize = 20;
-const AFTER: usize = 30;
+const AFTER: usize = 25;
 
 /// A merge as the page lists it.
 #[derive(Debug, Clone, Serialize)]

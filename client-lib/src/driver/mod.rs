@@ -10,7 +10,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use protocol::manifest::ChunkRef;
-use protocol::message::{Priority, Telemetry};
+use protocol::message::{Priority, TagOutcome, Telemetry};
 use protocol::session::{self, ClientEvent, Time};
 use protocol::{ChunkHash, GarmentId, SignedManifest};
 use tokio::sync::mpsc;
@@ -75,6 +75,7 @@ impl Driver {
             garments: config.garments.clone(),
             publisher: config.publisher,
             jitter_seed: config.jitter_seed,
+            pin: config.version,
         });
         Self {
             dialer: Dialer::new(config.address.clone(), pin, sender),
@@ -152,6 +153,11 @@ impl Driver {
         if self.reported.elapsed() >= REPORT {
             self.report();
         }
+        for (garment, state) in self.shared.take_tags() {
+            if !self.session.tag(garment, state) {
+                self.shared.answer_tag(garment, state, TagOutcome::Failed);
+            }
+        }
         self.leave_if_asked();
         self.act();
         self.transmit();
@@ -206,6 +212,9 @@ impl Driver {
                 }),
                 ClientEvent::Version(signed) => self.take_version(&signed),
                 ClientEvent::Chunk { hash, bytes } => self.take_chunk(hash, &bytes),
+                ClientEvent::Tagged { garment, state, outcome } => {
+                    self.shared.answer_tag(garment, state, outcome);
+                }
                 ClientEvent::Missing { hash } => {
                     self.wanted.remove(&hash);
                     self.note(format!("the server does not have chunk {hash}"));

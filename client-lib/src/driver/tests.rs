@@ -84,7 +84,7 @@ impl TestServer {
         let (accepting, served) = (endpoint.clone(), Arc::clone(&world));
         runtime.spawn(async move {
             while let Some(incoming) = accepting.accept().await {
-                let config = ServerConfig { token: token.clone() };
+                let config = ServerConfig { token: token.clone(), tag_token: None };
                 tokio::spawn(serve(incoming, config, Arc::clone(&served), heads.clone()));
             }
         });
@@ -158,7 +158,10 @@ async fn serve(
                     let _ = send.finish();
                     return connection.close(code.number().into(), message.as_bytes());
                 }
-                ServerEvent::Cancel { .. } | ServerEvent::Open { .. } => {}
+                ServerEvent::Cancel { .. }
+                | ServerEvent::Open { .. }
+                | ServerEvent::Pin(_)
+                | ServerEvent::Tag { .. } => {}
             }
         }
         while let Some(bytes) = session.poll_transmit() {

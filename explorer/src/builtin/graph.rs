@@ -15,16 +15,31 @@ use crate::import::transition::{self, Transition};
 use crate::primary::{PrimaryEdge, PrimaryError, PrimaryGraph, PrimaryPose};
 
 /// Clip names and the frames between which a transition may leave the one and enter the other.
-/// Actions are left near their end and entered near their start; gaits at any frame, and where
-/// they come twice, once on each foot.
-const TRANSITIONS: [(&str, Range<usize>, &str, Range<usize>); 23] = [
-    ("walk", 0..16, "run", 0..22),
-    ("walk", 16..32, "run", 0..22),
-    ("run", 0..11, "walk", 0..32),
-    ("run", 11..22, "walk", 0..32),
-    ("walk", 0..32, "turn", 0..28),
-    ("turn", 0..14, "walk", 0..32),
-    ("turn", 14..28, "walk", 0..32),
+/// Actions are left near their end and entered near their start. Gaits are left about every eight
+/// frames: whoever steers gets from one to another within half a second, the transition included.
+const TRANSITIONS: [(&str, Range<usize>, &str, Range<usize>); 38] = [
+    ("walk", 0..8, "run", 0..22),
+    ("walk", 8..16, "run", 0..22),
+    ("walk", 16..24, "run", 0..22),
+    ("walk", 24..32, "run", 0..22),
+    ("run", 0..7, "walk", 0..32),
+    ("run", 7..14, "walk", 0..32),
+    ("run", 14..22, "walk", 0..32),
+    ("walk", 0..8, "turn", 0..28),
+    ("walk", 8..16, "turn", 0..28),
+    ("walk", 16..24, "turn", 0..28),
+    ("walk", 24..32, "turn", 0..28),
+    ("turn", 0..7, "walk", 0..32),
+    ("turn", 7..14, "walk", 0..32),
+    ("turn", 14..21, "walk", 0..32),
+    ("turn", 21..28, "walk", 0..32),
+    ("run", 0..7, "turn", 0..28),
+    ("run", 7..14, "turn", 0..28),
+    ("run", 14..22, "turn", 0..28),
+    ("turn", 0..7, "run", 0..22),
+    ("turn", 7..14, "run", 0..22),
+    ("turn", 14..21, "run", 0..22),
+    ("turn", 21..28, "run", 0..22),
     ("walk", 0..32, "jump", 0..5),
     ("walk", 0..32, "kick", 0..4),
     ("walk", 0..32, "spin", 0..5),

@@ -14,6 +14,7 @@ use super::graph::{Graph, GraphError, Kind};
 use super::plan::Plan;
 use super::policy::Steering;
 use super::record::{FailedRecord, JobRecord, MergeRecord, PublishRecord, Record};
+use super::view::KindAt;
 use crate::primary::PrimaryGraph;
 use crate::scene::Scene;
 use crate::simulator::FrameQuality;
@@ -87,6 +88,18 @@ pub struct Ledger {
     quality: FrameQuality,
     published: Option<PublishRecord>,
     steering: Steering,
+    tags: Tags,
+}
+
+/// Dead ends that people pointed at.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+struct Tags {
+    /// The newest tag that was read.
+    newest: u64,
+    /// Those whose turn has not come yet.
+    waiting: Vec<StateId>,
+    /// Whether the open round, or the last that was, is theirs.
+    have_round: bool,
 }
 
 impl Ledger {
@@ -112,6 +125,7 @@ impl Ledger {
             quality: FrameQuality::default(),
             published: None,
             steering: Steering::new(primary),
+            tags: Tags::default(),
         }
     }
 
@@ -143,6 +157,17 @@ impl Ledger {
     /// What jobs are chosen by.
     pub fn steering(&self) -> &Steering {
         &self.steering
+    }
+
+    /// The newest tag that was read; 0 for none.
+    pub fn newest_tag(&self) -> u64 {
+        self.tags.newest
+    }
+
+    /// Whether the open round, or the last that was, simulates what people pointed at: they are
+    /// shown what came of it at once.
+    pub fn is_round_of_tags(&self) -> bool {
+        self.tags.have_round
     }
 
     /// The last version known to be in the store.
@@ -221,6 +246,12 @@ impl Ledger {
                 self.steering.steer(steer);
                 Ok(())
             }
+            Record::Tagged(_) if !self.round.is_done() => Err(LedgerError::OutOfTurn("a tag")),
+            Record::Tagged(tagged) => {
+                self.tags.newest = tagged.newest;
+                self.tags.waiting.extend(&tagged.states);
+                Ok(())
+            }
         }
     }
 
@@ -239,6 +270,11 @@ impl Ledger {
     fn expansions(&mut self) -> Vec<Job> {
         let set_aside = &self.set_aside;
         let free = |state: StateId| !set_aside.contains(&state);
+        let tagged = tagged(&self.graph, &mut self.tags.waiting, self.round_jobs, &free);
+        self.tags.have_round = !tagged.is_empty();
+        if self.tags.have_round {
+            return tagged.into_iter().map(Job::Expand).collect();
+        }
         let chosen = self.steering.choose(&self.graph, self.round_jobs, &free);
         chosen.into_iter().map(Job::Expand).collect()
     }
@@ -346,4 +382,23 @@ impl Ledger {
         }
         Ok(self.graph.end_initial_pass()?)
     }
+}
+
+/// Takes the first tagged states off the list that are dead ends still and free.
+fn tagged(
+    graph: &Graph,
+    waiting: &mut Vec<StateId>,
+    most: usize,
+    free: &dyn Fn(StateId) -> bool,
+) -> Vec<StateId> {
+    let mut chosen = Vec::new();
+    while let Some(state) = waiting.first().copied().filter(|_| chosen.len() < most) {
+        waiting.remove(0);
+        let is_dead_end = state.0 < graph.next_id().0
+            && matches!(graph.kind_at(state, graph.commit()), KindAt::DeadEnd(..));
+        if is_dead_end && free(state) && !chosen.contains(&state) {
+            chosen.push(state);
+        }
+    }
+    chosen
 }

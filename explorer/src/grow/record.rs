@@ -29,6 +29,17 @@ pub enum Record {
     Published(PublishRecord),
     /// From the next round on, jobs are chosen by this.
     Steer(SteerRecord),
+    /// People pointed at these dead ends: they come before all others, a round of their own.
+    Tagged(TagRecord),
+}
+
+/// Tags that were read.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TagRecord {
+    /// The newest tag that was read.
+    pub newest: u64,
+    /// What was tagged, in order.
+    pub states: Vec<StateId>,
 }
 
 /// The drape.

@@ -20,7 +20,7 @@ use super::journal::{Journal, JournalError};
 use super::ledger::{Job, Ledger, LedgerError};
 use super::record::{
     DrapeRecord, FailedRecord, FrameRecord, Header, JobRecord, MergeRecord, PublishRecord, Record,
-    SteerRecord,
+    SteerRecord, TagRecord,
 };
 use super::similar::{Found, Similar};
 use super::states::StateFile;
@@ -221,6 +221,14 @@ impl Work {
     /// The folder cannot be written.
     pub fn steer(&mut self, steer: SteerRecord) -> Result<(), WorkError> {
         self.record(&Record::Steer(steer))
+    }
+
+    /// Dead ends that people pointed at: the next round is theirs.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub fn tag(&mut self, tagged: TagRecord) -> Result<(), WorkError> {
+        self.record(&Record::Tagged(tagged))
     }
 
     /// Commits the outcome of the round's next job.

@@ -8,11 +8,11 @@ use super::wants::{Change, Wants};
 use super::{Allowance, Time};
 use crate::difference::ManifestDifference;
 use crate::frame::{CHUNK_HEAD_BYTES, FrameDecoder, frame, parse_chunk_head};
-use crate::ids::{ChunkHash, VersionNumber};
+use crate::ids::{ChunkHash, GarmentId, StateId, VersionNumber};
 use crate::limits;
 use crate::manifest::{ChunkRef, SignedManifest};
 use crate::message::{
-    ClientMessage, CloseCode, Have, Hello, PROTOCOL, Priority, ServerMessage, Telemetry,
+    ClientMessage, CloseCode, Have, Hello, PROTOCOL, Priority, ServerMessage, TagOutcome, Telemetry,
 };
 use crate::sign::PublisherKey;
 
@@ -28,6 +28,8 @@ pub struct ClientConfig {
     pub publisher: Option<PublisherKey>,
     /// Spreads the reconnections of many clients; any number that differs between them.
     pub jitter_seed: u64,
+    /// The only version that is wanted; `None`: always the newest.
+    pub pin: Option<VersionNumber>,
 }
 
 /// What the driver has to do, or hand to the player.
@@ -51,6 +53,15 @@ pub enum ClientEvent {
     Missing {
         /// Its name.
         hash: ChunkHash,
+    },
+    /// What became of a tag.
+    Tagged {
+        /// The garment.
+        garment: GarmentId,
+        /// The dead end.
+        state: StateId,
+        /// The server's answer.
+        outcome: TagOutcome,
     },
     /// Close the connection (with this code) if it is still there. Unless the reason
     /// [is final](SessionError::is_final), a `Connect` follows after a while, and everything that
@@ -249,6 +260,16 @@ impl Client {
         self.say(ClientMessage::Telemetry(telemetry));
     }
 
+    /// Asks that the explorer simulate at this dead end next; answered by [`ClientEvent::Tagged`]. Says
+    /// `false`, and nothing else, while the line is down.
+    pub fn tag(&mut self, garment: GarmentId, state: StateId) -> bool {
+        let open = self.link == Link::Open;
+        if open {
+            self.say(ClientMessage::Tag { garment, state });
+        }
+        open
+    }
+
     /// Says bye after what is queued; ends in a final `Disconnect`.
     pub fn close(&mut self) {
         if self.link == Link::Open {
@@ -324,7 +345,7 @@ impl Client {
         let have = self
             .manifest
             .as_ref()
-            .filter(|_| !self.whole)
+            .filter(|_| !self.whole && self.config.pin.is_none())
             .map(|held| Have { version: held.manifest.number, hash: held.manifest.hash() });
         ClientMessage::Hello(Hello {
             protocol: PROTOCOL,
@@ -362,6 +383,9 @@ impl Client {
                 self.link = Link::Open;
                 self.opened = Some(now);
                 self.events.push_back(ClientEvent::Welcome);
+                if let Some(version) = self.config.pin {
+                    self.say(ClientMessage::Pin { version });
+                }
                 if let Some(version) = self.applied {
                     self.say(ClientMessage::Applied { version });
                 }
@@ -372,6 +396,8 @@ impl Client {
                 let publisher = self.known_publisher()?;
                 self.accept(SignedManifest::open(&bytes, &publisher)?)
             }
+            // The head, said before the server had read our wish.
+            ServerMessage::ManifestDifference(_) if self.config.pin.is_some() => Ok(()),
             ServerMessage::ManifestDifference(bytes) => {
                 let publisher = self.known_publisher()?;
                 let difference = ManifestDifference::decode(&bytes)?;
@@ -388,6 +414,10 @@ impl Client {
                 Ok(())
             }
             ServerMessage::Close { code, message } => Err(SessionError::Closed { code, message }),
+            ServerMessage::Tagged { garment, state, outcome } => {
+                self.events.push_back(ClientEvent::Tagged { garment, state, outcome });
+                Ok(())
+            }
         }
     }
 
@@ -409,6 +439,9 @@ impl Client {
 
     fn accept(&mut self, signed: SignedManifest) -> Result<(), SessionError> {
         let offered = signed.manifest.number;
+        if self.config.pin.is_some_and(|pin| pin != offered || self.manifest.is_some()) {
+            return Ok(());
+        }
         if let Some(held) = &self.manifest {
             if self.whole && **held == signed {
                 self.whole = false;

@@ -6,11 +6,11 @@ use std::sync::Arc;
 use super::{Allowance, Time};
 use crate::difference::ManifestDifference;
 use crate::frame::{FrameDecoder, frame};
-use crate::ids::{ChunkHash, VersionNumber};
+use crate::ids::{ChunkHash, GarmentId, StateId, VersionNumber};
 use crate::limits;
 use crate::manifest::SignedManifest;
 use crate::message::{
-    ClientMessage, CloseCode, Have, Hello, PROTOCOL, Priority, ServerMessage, Telemetry,
+    ClientMessage, CloseCode, Have, Hello, PROTOCOL, Priority, ServerMessage, TagOutcome, Telemetry,
 };
 use crate::sign::PublisherKey;
 
@@ -19,6 +19,8 @@ use crate::sign::PublisherKey;
 pub struct ServerConfig {
     /// Every client must show this token; `None`: all are let in.
     pub token: Option<String>,
+    /// Clients that show this token instead may set tags; `None`: nobody may.
+    pub tag_token: Option<String>,
 }
 
 /// What the driver has to do.
@@ -55,6 +57,15 @@ pub enum ServerEvent {
         /// Traversals above the cap, dropped.
         dropped: u64,
     },
+    /// The client wants this version and no other: answer by [`Server::handle_pinned`].
+    Pin(VersionNumber),
+    /// Keep a tag, of a client that may set it: answer by [`Server::handle_tagged`].
+    Tag {
+        /// The garment.
+        garment: GarmentId,
+        /// The dead end.
+        state: StateId,
+    },
     /// The conversation is over: write what `poll_transmit` still gives, then close the connection
     /// with this code and text.
     Closed {
@@ -81,6 +92,10 @@ pub struct Server {
     fetches: BTreeSet<ChunkHash>,
     messages: Allowance,
     traversals: Allowance,
+    may_tag: bool,
+    tags: Allowance,
+    /// No other version than this is sent.
+    pinned: Option<VersionNumber>,
     outbox: VecDeque<ServerMessage>,
     events: VecDeque<ServerEvent>,
 }
@@ -119,6 +134,9 @@ impl Server {
             fetches: BTreeSet::new(),
             messages: Allowance::new(messages, messages),
             traversals: Allowance::new(traversals, limits::TRAVERSALS_BURST_MAX),
+            may_tag: false,
+            tags: Allowance::new(limits::TAGS_PER_SECOND_MAX, limits::TAGS_BURST_MAX),
+            pinned: None,
             outbox: VecDeque::new(),
             events: VecDeque::new(),
         }
@@ -161,7 +179,7 @@ impl Server {
     /// The head of the store; an older one than before is ignored.
     pub fn handle_head(&mut self, head: &Arc<SignedManifest>) {
         let held = self.head.as_ref().map(|held| held.manifest.number);
-        if held < Some(head.manifest.number) {
+        if self.pinned.is_none() && held < Some(head.manifest.number) {
             self.head = Some(head.clone());
         }
     }
@@ -174,6 +192,25 @@ impl Server {
         let have_hash = self.have.map(|have| have.hash);
         let held = manifest.filter(|held| Some(held.manifest.hash()) == have_hash);
         self.base = held.map_or(Base::Nothing, Base::Held);
+    }
+
+    /// The version that [`ServerEvent::Pin`] asked for; `None` where the store has none, which ends the
+    /// conversation.
+    pub fn handle_pinned(&mut self, number: VersionNumber, manifest: Option<Arc<SignedManifest>>) {
+        if self.pinned != Some(number) {
+            return;
+        }
+        match manifest {
+            Some(manifest) => self.head = Some(manifest),
+            None => self.close(CloseCode::Done, &format!("there is no version {number}")),
+        }
+    }
+
+    /// What became of a tag.
+    pub fn handle_tagged(&mut self, garment: GarmentId, state: StateId, outcome: TagOutcome) {
+        if self.link == Link::Open {
+            self.outbox.push_back(ServerMessage::Tagged { garment, state, outcome });
+        }
     }
 
     /// A chunk was sent whole.
@@ -263,6 +300,14 @@ impl Server {
             }
             (ClientMessage::Telemetry(telemetry), _) => self.weigh(now, telemetry),
             (ClientMessage::Bye, _) => self.close(CloseCode::Done, "bye"),
+            (ClientMessage::Pin { version }, _) => {
+                self.pinned = Some(version);
+                self.head = None;
+                self.have = None;
+                self.base = Base::Nothing;
+                self.events.push_back(ServerEvent::Pin(version));
+            }
+            (ClientMessage::Tag { garment, state }, _) => self.tag(now, garment, state),
         }
     }
 
@@ -271,7 +316,8 @@ impl Server {
             let why = format!("this server speaks protocol {PROTOCOL}, not {}", hello.protocol);
             return self.close(CloseCode::OtherProtocol, &why);
         }
-        if !self.lets_in(hello.token.as_deref()) {
+        self.may_tag = is_shown(self.config.tag_token.as_deref(), hello.token.as_deref());
+        if !self.may_tag && !self.lets_in(hello.token.as_deref()) {
             return self.close(CloseCode::TokenRefused, "this server asks for another token");
         }
         self.link = Link::Open;
@@ -286,10 +332,21 @@ impl Server {
     }
 
     fn lets_in(&self, token: Option<&str>) -> bool {
-        let Some(expected) = &self.config.token else { return true };
-        // Hashes compare in constant time, so that a token cannot be guessed byte by byte.
-        let hash = |text: &str| blake3::hash(text.as_bytes());
-        token.is_some_and(|token| hash(token) == hash(expected))
+        self.config.token.is_none() || is_shown(self.config.token.as_deref(), token)
+    }
+
+    fn tag(&mut self, now: Time, garment: GarmentId, state: StateId) {
+        if !self.may_tag {
+            self.handle_tagged(garment, state, TagOutcome::NotAllowed);
+        } else if self.tags.take(now, 1) == 0 {
+            self.handle_tagged(garment, state, TagOutcome::TooMany);
+        } else {
+            self.events.push_back(ServerEvent::Tag { garment, state });
+        }
+        // Answers that the client does not read.
+        if self.fetches.len() + self.outbox.len() > limits::FETCHES_MAX {
+            self.close(CloseCode::TooManyMessages, "answers to tags are not read");
+        }
     }
 
     /// Caps what one client adds to the counts.
@@ -325,4 +382,11 @@ impl Server {
         self.base = Base::Held(head.clone());
         Some(message)
     }
+}
+
+/// Whether a token is the expected one; not, where none is expected.
+fn is_shown(expected: Option<&str>, token: Option<&str>) -> bool {
+    // Hashes compare in constant time, so that a token cannot be guessed byte by byte.
+    let hash = |text: &str| blake3::hash(text.as_bytes());
+    token.zip(expected).is_some_and(|(token, expected)| hash(token) == hash(expected))
 }

@@ -7,6 +7,7 @@ use protocol::links::{LinkEntry, LinkPage};
 use protocol::manifest::ManifestError;
 use protocol::region::RegionChunk;
 use protocol::scene::{GarmentChunk, SceneChunk};
+use protocol::tag::Tag;
 use protocol::telemetry::TelemetryBatch;
 use protocol::{
     ChunkHash, DecodeError, Manifest, ManifestDifference, PoseId, SignedManifest, SigningKey,
@@ -33,6 +34,7 @@ fn stored() -> Vec<Sample> {
         }),
         ("difference", difference().encode(), |b| ManifestDifference::decode(b).is_ok()),
         ("telemetry", samples::telemetry().encode(), |b| TelemetryBatch::decode(b).is_ok()),
+        ("tag", samples::tag().encode(), |b| Tag::decode(b).is_ok()),
     ]
 }
 
@@ -42,6 +44,7 @@ fn round_trips() {
     assert_eq!(GarmentChunk::decode(&samples::garment().encode()).unwrap(), samples::garment());
     let telemetry = samples::telemetry();
     assert_eq!(TelemetryBatch::decode(&telemetry.encode()).unwrap(), telemetry);
+    assert_eq!(Tag::decode(&samples::tag().encode()).unwrap(), samples::tag());
     assert_eq!(RegionChunk::decode(&samples::regions().encode()).unwrap(), samples::regions());
     assert_eq!(LinkPage::decode(&samples::page().encode()).unwrap(), samples::page());
     let signed = samples::manifest(1, 2, 3, 0).sign(&samples::key());
@@ -79,6 +82,7 @@ fn golden_bytes() {
         "manifest 396 cc6e53307ded4867",
         "difference 368 c12553a3b55bdd9d",
         "telemetry 14 870948e974c6b945",
+        "tag 10 82561d246f31ebfb",
     ];
     assert_eq!(digests, golden);
 }

@@ -4,6 +4,7 @@ use protocol::links::{LinkEntry, LinkPage};
 use protocol::manifest::{ChunkRef, GarmentVersion, GenerationRef, RegionChunkRef, VersionStats};
 use protocol::region::{RegionChunk, RegionEntry};
 use protocol::scene::{BodyMesh, Capsule, Edge, GarmentChunk, Joint, Pose, SceneChunk};
+use protocol::tag::Tag;
 use protocol::telemetry::{GarmentCounts, TelemetryBatch};
 use protocol::{
     ChunkHash, EdgeId, GarmentId, GenerationId, Manifest, PoseId, SigningKey, StateId,
@@ -80,6 +81,10 @@ pub fn page() -> LinkPage {
 pub fn telemetry() -> TelemetryBatch {
     let edges = vec![(EdgeId(0), 300), (EdgeId(3), 1)];
     TelemetryBatch { garments: vec![GarmentCounts { garment: GarmentId(0), edges }] }
+}
+
+pub fn tag() -> Tag {
+    Tag { garment: GarmentId(0), state: StateId(300), version: VersionNumber(7) }
 }
 
 pub fn chunk(name: u64) -> ChunkRef {

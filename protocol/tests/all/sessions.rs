@@ -6,12 +6,14 @@ use std::sync::Arc;
 use protocol::frame::{chunk_head, frame};
 use protocol::manifest::ChunkRef;
 use protocol::message::{
-    ClientMessage, CloseCode, Hello, PROTOCOL, Priority, ServerMessage, Telemetry,
+    ClientMessage, CloseCode, Hello, PROTOCOL, Priority, ServerMessage, TagOutcome, Telemetry,
 };
 use protocol::session::{
     Client, ClientConfig, ClientEvent, Server, ServerConfig, ServerEvent, SessionError, Time,
 };
-use protocol::{ChunkHash, EdgeId, GarmentId, SignedManifest, SigningKey, VersionNumber, limits};
+use protocol::{
+    ChunkHash, EdgeId, GarmentId, SignedManifest, SigningKey, StateId, VersionNumber, limits,
+};
 
 use crate::link::{Faults, Link, Random, To};
 use crate::samples;
@@ -50,7 +52,7 @@ impl Pair {
             now: Time(0),
             client: Client::new(config),
             server: None,
-            server_config: ServerConfig { token: Some("letmein".into()) },
+            server_config: ServerConfig { token: Some("letmein".into()), tag_token: None },
             link: Link::new(faults, seed),
             chunks: BTreeMap::new(),
             versions: Vec::new(),
@@ -163,7 +165,7 @@ impl Pair {
             // Bye is still under way.
             ClientEvent::Disconnect { reason: SessionError::Done } => {}
             ClientEvent::Disconnect { .. } => self.server = None,
-            ClientEvent::Welcome | ClientEvent::Missing { .. } => {}
+            ClientEvent::Welcome | ClientEvent::Missing { .. } | ClientEvent::Tagged { .. } => {}
         }
         self.client_events.push_back(event);
     }
@@ -198,6 +200,8 @@ impl Pair {
                     }
                 },
                 ServerEvent::Applied(_)
+                | ServerEvent::Pin(_)
+                | ServerEvent::Tag { .. }
                 | ServerEvent::Cancel { .. }
                 | ServerEvent::Telemetry { .. }
                 | ServerEvent::Closed { .. } => {}
@@ -536,6 +540,11 @@ fn golden_messages() {
     assert_eq!(hex(&frame_bytes), "0c000000000101017401".to_string() + "04726f626500");
     assert_eq!(hex(&ClientMessage::Applied { version: VersionNumber(300) }.encode()), "03ac02");
     assert_eq!(hex(&ClientMessage::Bye.encode()), "05");
+    assert_eq!(hex(&ClientMessage::Pin { version: VersionNumber(300) }.encode()), "06ac02");
+    let (garment, state) = (GarmentId(1), StateId(300));
+    assert_eq!(hex(&ClientMessage::Tag { garment, state }.encode()), "0701ac02");
+    let outcome = TagOutcome::Kept { number: 9 };
+    assert_eq!(hex(&ServerMessage::Tagged { garment, state, outcome }.encode()), "0601ac020009");
     let welcome = ServerMessage::Welcome { protocol: PROTOCOL, publisher: None };
     assert_eq!(hex(&welcome.encode()), "000100");
     let close = ServerMessage::Close { code: CloseCode::Full, message: "later".into() };

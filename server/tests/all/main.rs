@@ -3,4 +3,5 @@
 mod faults;
 mod player;
 mod serving;
+mod tags;
 mod world;

@@ -5,9 +5,9 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use protocol::message::{ALPN, Priority};
+use protocol::message::{ALPN, Priority, TagOutcome};
 use protocol::session::{Client, ClientConfig, ClientEvent, SessionError, Time};
-use protocol::{ChunkHash, VersionNumber};
+use protocol::{ChunkHash, StateId, VersionNumber};
 use quinn::crypto::rustls::QuicClientConfig;
 use quinn::{Connection, Endpoint, RecvStream, SendStream};
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
@@ -22,6 +22,7 @@ pub struct Player {
     pub versions: Vec<VersionNumber>,
     pub missing: Vec<ChunkHash>,
     pub ended: Option<SessionError>,
+    pub tagged: Vec<(StateId, TagOutcome)>,
     pub connections: u32,
     server: SocketAddr,
     endpoint: Endpoint,
@@ -38,13 +39,24 @@ struct Line {
 
 impl Player {
     pub fn new(server: &server::Server, token: Option<&str>) -> Self {
-        let config = ClientConfig { token: token.map(String::from), ..ClientConfig::default() };
+        Self::pinned(server, token, None)
+    }
+
+    /// One that wants a version and no other.
+    pub fn pinned(
+        server: &server::Server,
+        token: Option<&str>,
+        pin: Option<VersionNumber>,
+    ) -> Self {
+        let token = token.map(String::from);
+        let config = ClientConfig { token, pin, ..ClientConfig::default() };
         Self {
             machine: Client::new(config),
             chunks: BTreeMap::new(),
             versions: Vec::new(),
             missing: Vec::new(),
             ended: None,
+            tagged: Vec::new(),
             connections: 0,
             server: server.quic_addr(),
             endpoint: endpoint(server.fingerprint(), ALPN),
@@ -139,6 +151,7 @@ impl Player {
                 self.line = None;
             }
             ClientEvent::Welcome => {}
+            ClientEvent::Tagged { state, outcome, .. } => self.tagged.push((state, outcome)),
         }
     }
 }

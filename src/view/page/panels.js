@@ -277,11 +277,15 @@ class Panels {
   takeAnswers(answers) {
     if (!answers) return;
     const s = value => `${value.toFixed(2)} s`;
-    at("answers").textContent = answers.count
-      ? `Press to clip: last ${s(answers.last.arrived_s)} (begins after ${s(answers.last.begun_s)}); of ${answers.count}: `
-        + `median ${s(answers.arrived_median_s)}, 90 % within ${s(answers.arrived_p90_s)}, `
-        + `begins after ${s(answers.begun_median_s)} (median)`
-      : "Press a clip's button, its number, an arrow or a gamepad's stick: the walk takes the shortest way there.";
+    const pressed = answers.count
+      ? `Last press: there after ${s(answers.last.arrived_s)}, begun after ${s(answers.last.begun_s)}. `
+        + `Of ${answers.count}: median ${s(answers.arrived_median_s)}, 90 % within ${s(answers.arrived_p90_s)}. `
+      : "Press a clip's button, its number, an arrow or a gamepad's stick: the walk takes the shortest way there. ";
+    const rehearsed = this.version && this.version.rehearsed;
+    const known = rehearsed && rehearsed.locomotion.presses
+      ? `This graph, over ${rehearsed.all.presses} seeded presses: locomotion median ${s(rehearsed.locomotion.median_s)}, `
+        + `90 % within ${s(rehearsed.locomotion.p90_s)}; any clip ${s(rehearsed.all.median_s)} and ${s(rehearsed.all.p90_s)}.` : "";
+    at("answers").textContent = pressed + known;
   }
 
   takeTags(tags) {
@@ -298,9 +302,8 @@ class Panels {
   }
 
   takeCost(said, pageMs) {
-    const each = said.frame_us / said.characters;
     const rows = [["characters", whole.format(said.characters)], ["decode, each", long(said.decode_us / 1000)],
-      ["decode, skin, normals, quantise, each", long(each / 1000)], ["coefficients resident, all", sized(said.resident_bytes)],
+      ["decode, skin, normals, quantise, each", long(said.write_us / 1000)], ["coefficients resident, all", sized(said.resident_bytes)],
       ["basis, once for all", sized(said.basis_bytes)], ["page, per frame", long(pageMs)],
       ["columns", whole.format(said.columns)]];
     at("cost").replaceChildren(...rows.flatMap(([name, value]) => [made("dt", name), made("dd", value)]));
