@@ -292,12 +292,21 @@ pub struct Simulate {
     /// random:SEED, clip:A,B,... or edges:FILE. A walk through clips starts at the first of them.
     #[arg(long, default_value = "random:1")]
     pub walk: String,
-    /// Frames to simulate, at least 1.
-    #[arg(long, default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..))]
-    pub frames: u64,
+    /// Frames to simulate, at least 1 [default: 300; of a soak 100000].
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    pub frames: Option<u64>,
     /// Vertices of the garment, exactly [default: as the scene says].
     #[arg(long, value_name = "N")]
     pub vertices: Option<usize>,
+    /// Stop after this long, e.g. 60s, 5m.
+    #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+    pub time: Option<Duration>,
+    /// For hours, unattended: a frame that cannot be simulated is counted and the walk begun anew.
+    #[arg(long)]
+    pub soak: bool,
+    /// Three seconds of the walk at finer steps and on finer meshes, compared as a table.
+    #[arg(long, conflicts_with_all = ["soak", "frames", "refine", "nudge", "table", "export", "picture"])]
+    pub converge: bool,
     /// Divide every step by this more than usual.
     #[arg(long, default_value_t = 1, value_name = "K", visible_alias = "substeps",
           value_parser = clap::value_parser!(u32).range(1..=64))]

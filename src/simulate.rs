@@ -1,20 +1,27 @@
 //! `toile simulate`: a garment along a walk, simulated frame after frame.
 
-use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+mod converge;
+mod table;
+
 use std::sync::Arc;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Result, bail, ensure};
 use client_lib::{Walk, WalkSpec};
 use explorer::pack::scene_chunk::scene_chunk;
 use explorer::scene::Scene;
 use explorer::simulate::{Options, Step, Straight, Sum, Tally};
 use serde::Serialize;
 
+use self::table::Table;
 use crate::explore::Stop;
 use crate::live::Live;
 use crate::record::{Meshes, Recorder, Shown};
-use crate::{args, format, place, scene};
+use crate::{args, format, scene};
+
+/// Frames where the user does not say.
+const FRAMES: u64 = 300;
+/// The same of a soak.
+const SOAK_FRAMES: u64 = 100_000;
 
 /// What is printed with `--json`.
 #[derive(Debug, Serialize)]
@@ -27,6 +34,8 @@ struct Summary<'a> {
     nudge_microns: f32,
     /// Frames at which the walk was to end.
     frames_asked: u64,
+    /// Frames that could not be simulated; only of a soak, else this is an error.
+    frames_failed: u64,
     #[serde(flatten)]
     sum: Sum,
 }
@@ -35,44 +44,26 @@ struct Summary<'a> {
 pub fn run(a: &args::Simulate) -> Result<()> {
     let spec = WalkSpec::parse(&a.walk)?;
     ensure!(a.nudge.is_finite(), "--nudge {}: micrometres, a number", a.nudge);
-    let mut recorder = Recorder::new(a.export.clone(), a.picture.clone(), a.frames)?;
-    let mut table = a.table.clone().map(Table::new).transpose()?;
+    if a.converge {
+        return converge::run(a, &spec);
+    }
+    let frames = a.frames.unwrap_or(if a.soak { SOAK_FRAMES } else { FRAMES });
+    let recorder = Recorder::new(a.export.clone(), a.picture.clone(), frames)?;
+    let table = a.table.clone().map(Table::new).transpose()?;
     let mut scene = scene::load_with(&a.scene, a.vertices)?;
     start_at_clip(&mut scene, &spec);
-    let scene = &scene;
-    let mut walk = walk(scene, &spec)?;
-    let stop = Stop::on_signals()?;
-    let mut live = Live::new(Some(a.frames));
-    live.tell(0, || "draping the garment".into());
-    let options = Options { refine: a.refine, nudge_m: a.nudge * 1e-6 };
-    let mut straight = Straight::new(scene, options)?;
-    let mut tally = Tally::default();
-    for frame in 0..a.frames {
-        let Some(next) = walk.next().filter(|_| !stop.is_asked()) else {
-            live.note(&format!("the walk ends after {frame} of {} frames", a.frames));
-            break;
-        };
-        let step = straight.step(next)?;
-        tally.add(&step, &straight);
-        record(&mut recorder, &straight, scene, &step)?;
-        if let Some(table) = &mut table {
-            table.row(frame, &name(&straight, scene), &step)?;
-        }
-        live.tell(frame + 1, || line(&tally.sum()));
-    }
-    live.done();
+    let (tally, failed) = simulate(a, (&spec, frames), &scene, (recorder, table))?;
     let sum = tally.sum();
-    let vertices = scene.garment.positions.len();
-    let garment = &scene.garment.name;
-    recorder.write(&meshes(scene), format!("{garment}, {vertices} vertices, {}", a.walk))?;
-    if let Some(table) = table {
-        table.write()?;
-    }
     if sum.frames == 0 {
         bail!("not one frame was simulated");
     }
+    let (garment, vertices) = (&scene.garment.name, scene.garment.positions.len());
     if !a.json {
         print(garment, vertices, &sum);
+        if a.soak {
+            let slow = sum.frames_slow;
+            println!("{failed} frames failed, {slow} took more than ten times the median");
+        }
         return Ok(());
     }
     format::print_json(&Summary {
@@ -82,9 +73,55 @@ pub fn run(a: &args::Simulate) -> Result<()> {
         walk: &a.walk,
         refine: a.refine,
         nudge_microns: a.nudge,
-        frames_asked: a.frames,
+        frames_asked: frames,
+        frames_failed: failed,
         sum,
     })
+}
+
+/// Walks, and writes the files; also says how many frames failed.
+fn simulate(
+    a: &args::Simulate,
+    (spec, frames): (&WalkSpec, u64),
+    scene: &Scene,
+    (mut recorder, mut table): (Recorder, Option<Table>),
+) -> Result<(Tally, u64)> {
+    let mut walk = walk(scene, spec)?;
+    let stop = Stop::on_signals()?.after(a.time);
+    let mut live = Live::new(Some(frames));
+    live.tell(0, || "draping the garment".into());
+    let options = Options { refine: a.refine, nudge_m: a.nudge * 1e-6 };
+    let start = Straight::new(scene, options)?;
+    let mut straight = start.again(options)?;
+    let (mut tally, mut failed) = (Tally::default(), 0);
+    for frame in 0..frames {
+        let Some(next) = walk.next().filter(|_| !stop.is_asked()) else {
+            live.note(&format!("the walk ends after {frame} of {frames} frames"));
+            break;
+        };
+        let step = match straight.step(next) {
+            Err(error) if a.soak => {
+                failed += 1;
+                live.note(&format!("frame {frame}, begun anew: {error}"));
+                walk = again(scene, spec, failed)?;
+                straight = start.again(options)?;
+                continue;
+            }
+            step => step?,
+        };
+        tally.add(&step, &straight);
+        record(&mut recorder, &straight, scene, &step)?;
+        if let Some(table) = &mut table {
+            table.row(frame, &name(&straight, scene), &step)?;
+        }
+        live.tell(frame + 1, || line(&tally.sum()));
+    }
+    live.done();
+    let title =
+        format!("{}, {} vertices, {}", scene.garment.name, scene.garment.positions.len(), a.walk);
+    recorder.write(&meshes(scene), title)?;
+    table.map_or(Ok(()), Table::write)?;
+    Ok((tally, failed))
 }
 
 /// A walk through clips starts at the first one's first pose, so that its frames are not spent on
@@ -105,6 +142,14 @@ fn start_at_clip(scene: &mut Scene, spec: &WalkSpec) {
 fn walk(scene: &Scene, spec: &WalkSpec) -> Result<Walk> {
     let walked = Arc::new(client_lib::Scene::new(scene_chunk(scene))?);
     Ok(Walk::new(spec, &walked, scene.start)?)
+}
+
+/// A walk from the start again; a random one takes another way each time.
+fn again(scene: &Scene, spec: &WalkSpec, times: u64) -> Result<Walk> {
+    match spec {
+        WalkSpec::Random(seed) => walk(scene, &WalkSpec::Random(seed.wrapping_add(times << 32))),
+        other => walk(scene, other),
+    }
 }
 
 fn record(
@@ -143,7 +188,9 @@ fn meshes(scene: &Scene) -> Meshes<'_> {
 
 fn line(sum: &Sum) -> String {
     format!(
-        "{:.3} CPU s a frame, p99 {:.3}; stretch p99 {:.1} %, max {:.1} %; {} retried, {} flagged",
+        "{} frames: {:.3} CPU s a frame, p99 {:.3}; stretch p99 {:.1} %, max {:.1} %; {} retried, \
+         {} flagged",
+        sum.frames,
         sum.cpu_s_median,
         sum.cpu_s_p99,
         sum.stretch_p99_pct,
@@ -171,44 +218,4 @@ fn print(garment: &str, vertices: usize, s: &Sum) {
         "fastest vertex {:.1} m/s; {} frames retried, {} flagged",
         s.speed_max_m_s, s.frames_retried, s.frames_flagged
     );
-}
-
-/// The measures of every frame, for a spreadsheet.
-struct Table {
-    file: PathBuf,
-    text: String,
-}
-
-impl Table {
-    fn new(file: PathBuf) -> Result<Self> {
-        place::ensure_writable(&file)?;
-        let text = "frame,pose,cpu_s,substeps,iterations,deep_1mm,deep_5mm,pinched,depth_max_mm,\
-                    stretch_max_pct,speed_max_m_s,retried,flagged\n";
-        Ok(Self { file, text: text.into() })
-    }
-
-    fn row(&mut self, frame: u64, name: &str, step: &Step) -> Result<()> {
-        let q = &step.quality;
-        writeln!(
-            self.text,
-            "{frame},{name},{:.6},{},{},{},{},{},{:.3},{:.3},{:.3},{},{}",
-            step.cpu_s,
-            q.substeps,
-            q.iterations,
-            q.inside_vertex_frames,
-            q.deep_vertex_frames,
-            q.pinched_vertex_frames,
-            q.depth_max_m * 1e3,
-            q.stretch_max * 100.0,
-            q.speed_max_m_s,
-            q.frames_retried,
-            q.frames_flagged
-        )?;
-        Ok(())
-    }
-
-    fn write(self) -> Result<()> {
-        let at = |file: &Path| format!("writing {}", file.display());
-        std::fs::write(&self.file, self.text).with_context(|| at(&self.file))
-    }
 }

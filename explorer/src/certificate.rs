@@ -136,7 +136,7 @@ pub fn certify(
 /// Pairs of classes between which a simulated frame or a merge leads.
 pub fn bifurcations(view: &View<'_>, scene: &Scene) -> Vec<Bifurcation> {
     let graph = view.graph();
-    let class_of = |state: StateId| graph.state(state).class;
+    let class_of = |state: StateId| graph.state(state).class & !class::FLAGGED;
     let mut counts: BTreeMap<class::Class, u64> = BTreeMap::new();
     let mut crossings: BTreeMap<(class::Class, class::Class), Vec<StateId>> = BTreeMap::new();
     let mut merges: BTreeMap<(class::Class, class::Class), Vec<u64>> = BTreeMap::new();

@@ -140,7 +140,10 @@ impl ClothSimulator {
                     continue;
                 }
             };
-            let fault = Fault::of(&frame.quality, body_speed_m_s);
+            let crossings = frame.quality.crossings;
+            let is_new = crossings > 0 && crossings > self.crossings_of(state);
+            let fault = Fault::of(&frame.quality, body_speed_m_s)
+                .or(is_new.then_some(Fault::Crossings(crossings)));
             frame.quality.frames_retried = u64::from(attempt > 0);
             frame.quality.frames_flagged = u64::from(fault.is_some());
             kept = Some(frame);
@@ -152,6 +155,11 @@ impl ClothSimulator {
         let mut frame = kept.ok_or_else(|| SimulateError(text()))?;
         (frame.quality.substeps, frame.quality.iterations) = (substeps, iterations);
         Ok(frame)
+    }
+
+    fn crossings_of(&mut self, state: &GridState) -> u64 {
+        let positions: Vec<Vec3> = (0..state.vertex_count()).map(|v| state.position(v)).collect();
+        self.crossings.find(&positions).len() as u64
     }
 
     /// Speed of the fastest vertex of the body between two poses (m/s), measured on the straight

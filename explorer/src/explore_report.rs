@@ -110,6 +110,8 @@ pub struct Summary {
     pub frames_retried: u64,
     /// Frames that came out of bounds all the same.
     pub frames_flagged: u64,
+    /// Merges into flagged states: their poses have no other state yet, and are simulated first.
+    pub merges_into_flagged: u64,
     /// The policy.
     pub policy: Policy,
     /// Classes of states found, with how many states each has; one nameless class without rules.
@@ -187,10 +189,18 @@ impl Run {
         let millimetres = |m: f32| f64::from(m) * 1000.0;
         let wall_s = self.start.elapsed().as_secs_f64();
         let frames = graph.next_id().0 - self.first;
+        let unflagged = |class: class::Class| class & !class::FLAGGED;
         let crossed = |state: &crate::grow::graph::State| match state.kind {
-            Kind::DeadEnd { target, .. } => graph.state(target).class != state.class,
+            Kind::DeadEnd { target, .. } => {
+                unflagged(graph.state(target).class) != unflagged(state.class)
+            }
             _ => false,
         };
+        let into_flagged = |state: &crate::grow::graph::State| match state.kind {
+            Kind::DeadEnd { target, .. } => graph.state(target).class & class::FLAGGED != 0,
+            _ => false,
+        };
+        let merges_into_flagged = graph.states().iter().filter(|s| into_flagged(s)).count() as u64;
         let [visited_p95_mm, visited_mean_mm] = visited_mm(work);
         Summary {
             poses: graph.primary().poses().len() as u64,
@@ -210,7 +220,8 @@ impl Run {
             policy: ledger.steering().policy(),
             classes: classes(setup, work),
             merges_across_classes: graph.states().iter().filter(|s| crossed(s)).count() as u64,
-            implausible_merges: graph.crossings() as u64,
+            implausible_merges: graph.crossings() as u64 - merges_into_flagged,
+            merges_into_flagged,
             cpu_s: process_cpu_s().unwrap_or(wall_s),
             frames_per_wall_s: frames as f64 / wall_s.max(1e-9),
             visited_p95_mm,
@@ -224,7 +235,7 @@ impl Run {
 fn classes(setup: &Setup<'_>, work: &Work) -> Vec<ClassCount> {
     let mut counts = BTreeMap::<class::Class, u64>::new();
     for state in work.graph().states() {
-        *counts.entry(state.class).or_default() += 1;
+        *counts.entry(state.class & !class::FLAGGED).or_default() += 1;
     }
     let rules = &setup.scene.metric.classes;
     let named = |(class, states)| ClassCount { class: class::name(rules, class), states };

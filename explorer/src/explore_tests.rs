@@ -474,3 +474,34 @@ fn what_people_point_at_is_simulated_next_and_shown_at_once() {
 
 #[path = "explore_scale_tests.rs"]
 mod scale;
+
+#[test]
+fn nothing_merges_into_a_flagged_state_where_its_pose_has_another() {
+    let scene = toy_scene();
+    let mut found = 0;
+    for edge in 0..scene.primary.edges().len() as u32 {
+        let toy = Toy { doubtful: Some(EdgeId(edge)), ..Toy::new(200) };
+        let folder = tempfile::tempdir().unwrap();
+        let place = (folder.path(), &mut Memory::default());
+        let summary = explore(&scene, &toy, place, &options(400)).unwrap();
+        let work = Work::open(folder.path(), &scene, false).unwrap();
+        let graph = work.graph();
+        let flagged = |state: StateId| graph.state(state).class & crate::grow::class::FLAGGED != 0;
+        let all = (0..graph.next_id().0).map(StateId);
+        let count = all.clone().filter(|state| flagged(*state)).count() as u64;
+        assert_eq!(count, summary.frames_flagged, "each flagged frame is a flagged state");
+        let mut into_flagged = 0;
+        for state in all {
+            let Kind::DeadEnd { target, error_m } = graph.state(state).kind else { continue };
+            assert!(error_m < 100.0, "errors stay free of the penalty");
+            let others = graph.interior(graph.state(state).pose);
+            let better = others.iter().any(|other| !flagged(*other));
+            assert!(!flagged(target) || !better, "{state} merged into {target}");
+            into_flagged += u64::from(flagged(target));
+        }
+        assert_eq!(into_flagged, summary.merges_into_flagged);
+        assert_eq!(into_flagged, 0, "such poses are simulated first, so that none is left");
+        found += count;
+    }
+    assert!(found > 20, "{found}: the toy must flag something");
+}

@@ -125,7 +125,7 @@ pub fn graph_drawing(view: &View<'_>, scene: &Scene, by: ColourBy) -> Drawing {
     drawing.lines(merges, thickness, MERGE);
     let group = |id: StateId| match by {
         ColourBy::Clip => u32::from(graph.primary().pose(graph.state(id).pose).clip),
-        ColourBy::Class => u32::from(graph.state(id).class),
+        ColourBy::Class => u32::from(graph.state(id).class & !class::FLAGGED),
     };
     let mut lines: BTreeMap<u32, Vec<Vec<[f32; 2]>>> = BTreeMap::new();
     for id in 1..count {

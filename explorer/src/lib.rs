@@ -2,7 +2,8 @@
 //!
 //! Wings: [`import`] reads scenes, characters, motion graphs and garments; [`builtin`] makes the
 //! built-in scene; [`grow`] explores (graph, metric, queue, jobs, journal); [`pack`] builds the
-//! basis, encodes and publishes; [`explore`] ties them together; [`simulate`] walks without a graph.
+//! basis, encodes and publishes; [`explore`] ties them together; [`simulate`] walks without
+//! a graph; [`tailor`] makes garments for any body.
 //!
 //! Non-goals: who is connected (they meet in the store), what a region's bytes mean (`codec`).
 
@@ -25,6 +26,7 @@ pub mod scene;
 pub mod simulate;
 pub mod simulator;
 pub mod tags;
+pub mod tailor;
 pub mod telemetry;
 pub mod view;
 pub mod watchdog;

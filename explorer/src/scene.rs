@@ -50,8 +50,8 @@ pub struct MetricSettings {
     pub classes: Vec<ClassRule>,
 }
 
-/// Most rules of a scene: a state's class has one bit of each.
-pub const CLASS_RULES_MAX: usize = 8;
+/// Most rules of a scene: a state's class has one bit of each, and one for the watchdog's flag.
+pub const CLASS_RULES_MAX: usize = 7;
 
 /// Divides states into two values by where a region of the garment lies relative to a joint.
 #[derive(Debug, Clone, PartialEq)]
@@ -83,6 +83,8 @@ pub struct Garment {
     pub positions: Vec<Vec3>,
     /// Counter-clockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
+    /// Layer of each vertex, the innermost 0; empty where there is one layer.
+    pub layers: Vec<u8>,
     /// Vertices that are held to the body where they lie in the rest pose; sorted.
     pub attached: Vec<u32>,
     /// The cloth.

@@ -36,6 +36,9 @@ pub enum Fault {
     Speed(f32),
     /// This part of the vertices is deep in the body.
     Deep(f32),
+    /// The cloth cuts itself in more places than before: so many. A tangle that is not growing is
+    /// being worked out, and no fault of this frame.
+    Crossings(u64),
 }
 
 impl Fault {

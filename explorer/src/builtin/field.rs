@@ -4,7 +4,7 @@ use cloth::Vec3;
 
 /// A cone with round ends: the hull of two balls. Tagged with the joint that moves it.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct RoundCone {
+pub(crate) struct RoundCone {
     pub joint: u16,
     pub a: Vec3,
     pub b: Vec3,
@@ -41,13 +41,13 @@ impl RoundCone {
 }
 
 /// Union of two fields with a fillet of about `k` metres (quadratic blend).
-pub(super) fn join(a: f32, b: f32, k: f32) -> f32 {
+pub(crate) fn join(a: f32, b: f32, k: f32) -> f32 {
     let h = (k - (a - b).abs()).max(0.0) / k;
     a.min(b) - h * h * k * 0.25
 }
 
 /// Union of many cones with a fillet of `fillet_m`.
-pub(super) struct Union {
+pub(crate) struct Union {
     /// Each with a ball that holds it.
     cones: Vec<(RoundCone, Vec3, f32)>,
     fillet_m: f32,
@@ -76,7 +76,7 @@ impl Union {
 }
 
 /// Slope of a field, from its values at the corners of a tetrahedron half a millimetre around.
-pub(super) fn gradient(field: &dyn Fn(Vec3) -> f32, p: Vec3) -> Vec3 {
+pub(crate) fn gradient(field: &dyn Fn(Vec3) -> f32, p: Vec3) -> Vec3 {
     const H: f32 = 5e-4;
     const CORNERS: [Vec3; 4] = [
         Vec3::new(1.0, 1.0, 1.0),
@@ -88,7 +88,7 @@ pub(super) fn gradient(field: &dyn Fn(Vec3) -> f32, p: Vec3) -> Vec3 {
 }
 
 /// Moves `p` onto the zero set by at most four Newton steps.
-pub(super) fn project(field: &dyn Fn(Vec3) -> f32, mut p: Vec3) -> Vec3 {
+pub(crate) fn project(field: &dyn Fn(Vec3) -> f32, mut p: Vec3) -> Vec3 {
     for _ in 0..4 {
         let value = field(p);
         if value.abs() < 1e-5 {

@@ -57,6 +57,7 @@ pub(super) fn robe(body: &Body, vertices: Option<usize>) -> Result<Garment, Buil
         name: "robe".into(),
         positions: mesh.positions,
         triangles: mesh.triangles,
+        layers: Vec::new(),
         attached,
         fabric: Fabric {
             density: 0.18,
@@ -156,7 +157,7 @@ fn face(p: Vec3) -> f32 {
 }
 
 /// Takes away what lies beyond a cut and keeps the largest piece; returns each vertex's cut.
-fn cut_open(mesh: &mut Mesh, cuts: &[&dyn Fn(Vec3) -> f32]) -> Vec<u8> {
+pub(crate) fn cut_open(mesh: &mut Mesh, cuts: &[&dyn Fn(Vec3) -> f32]) -> Vec<u8> {
     let beyond = |p: Vec3| cuts.iter().any(|cut| cut(p) > 0.0);
     let positions = &mesh.positions;
     let centre = |t: &[u32; 3]| t.iter().map(|v| positions[*v as usize]).sum::<Vec3>() / 3.0;

@@ -11,14 +11,14 @@ mod character;
 mod clearance;
 mod clips;
 mod curve;
-mod field;
+pub(crate) mod field;
 mod figure;
 mod gait;
-mod garment;
+pub(crate) mod garment;
 mod graph;
-mod remesh;
+pub(crate) mod remesh;
 mod skeleton;
-mod surface;
+pub(crate) mod surface;
 #[cfg(test)]
 mod tests;
 

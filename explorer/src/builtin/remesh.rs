@@ -9,7 +9,7 @@ use super::field::project;
 use super::surface::{Mesh, directed_edges};
 
 /// What the mesh lies on, and how fine it shall be.
-pub(super) struct Target<'a> {
+pub(crate) struct Target<'a> {
     /// The surface: the zero set.
     pub surface: &'a dyn Fn(Vec3) -> f32,
     /// Boundaries lie where one of these is zero as well.
@@ -21,10 +21,10 @@ pub(super) struct Target<'a> {
 }
 
 /// A vertex that lies on no cut.
-pub(super) const INSIDE: u8 = u8::MAX;
+pub(crate) const INSIDE: u8 = u8::MAX;
 
 /// Remeshes. `cut_of` names for each vertex the cut whose boundary it lies on, or `INSIDE`.
-pub(super) fn remesh(mesh: &mut Mesh, cut_of: &mut Vec<u8>, target: &Target<'_>) {
+pub(crate) fn remesh(mesh: &mut Mesh, cut_of: &mut Vec<u8>, target: &Target<'_>) {
     for pass in 0..target.passes {
         // Changing connectivity to the end would leave the last triangles unrelaxed.
         if pass + 4 < target.passes {
@@ -40,7 +40,7 @@ pub(super) fn remesh(mesh: &mut Mesh, cut_of: &mut Vec<u8>, target: &Target<'_>)
 }
 
 /// Puts a vertex back where it belongs: on the surface, and on its cut.
-pub(super) fn settle(p: Vec3, cut: u8, target: &Target<'_>) -> Vec3 {
+pub(crate) fn settle(p: Vec3, cut: u8, target: &Target<'_>) -> Vec3 {
     let Some(cut) = target.cuts.get(cut as usize) else {
         return project(target.surface, p);
     };

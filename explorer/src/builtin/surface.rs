@@ -4,7 +4,7 @@ use cloth::Vec3;
 
 /// A triangle mesh; counter-clockwise seen from outside.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Mesh {
+pub(crate) struct Mesh {
     pub positions: Vec<Vec3>,
     pub triangles: Vec<[u32; 3]>,
 }
@@ -81,31 +81,49 @@ impl Mesh {
 }
 
 /// The three edges of a triangle in its winding.
-pub(super) fn directed_edges(t: &[u32; 3]) -> [[u32; 2]; 3] {
+pub(crate) fn directed_edges(t: &[u32; 3]) -> [[u32; 2]; 3] {
     [[t[0], t[1]], [t[1], t[2]], [t[2], t[0]]]
 }
 
 /// A box of cubic cells.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Grid {
+pub(crate) struct Grid {
     pub low: Vec3,
     pub high: Vec3,
     pub cell: f32,
 }
 
+impl Grid {
+    /// Nodes along each axis.
+    pub fn nodes(&self) -> [usize; 3] {
+        let size = ((self.high - self.low) / self.cell).ceil();
+        size.to_array().map(|s| s as usize + 1)
+    }
+
+    /// Where a node lies (m).
+    pub fn place(&self, i: [usize; 3]) -> Vec3 {
+        self.low + Vec3::new(i[0] as f32, i[1] as f32, i[2] as f32) * self.cell
+    }
+}
+
 /// Surface nets (Gibson 1998): a vertex in every cell that the surface crosses, at the mean of the
 /// crossings of its edges; a quad across every grid edge that it crosses. Manifold wherever no
 /// cell holds two sheets, that is for features larger than two cells.
-pub(super) fn surface_nets(field: &dyn Fn(Vec3) -> f32, grid: Grid) -> Mesh {
-    let size = ((grid.high - grid.low) / grid.cell).ceil();
-    let n = [size.x as usize + 1, size.y as usize + 1, size.z as usize + 1];
+pub(crate) fn surface_nets(field: &dyn Fn(Vec3) -> f32, grid: Grid) -> Mesh {
+    let values: Vec<f32> = nodes(grid.nodes()).map(|i| field(grid.place(i))).collect();
+    nets_of(&values, grid)
+}
+
+/// All nodes of a grid, x fastest.
+pub(crate) fn nodes(n: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
+    (0..n[2]).flat_map(move |z| (0..n[1]).flat_map(move |y| (0..n[0]).map(move |x| [x, y, z])))
+}
+
+/// As [`surface_nets`], of the field's values at the nodes.
+pub(crate) fn nets_of(values: &[f32], grid: Grid) -> Mesh {
+    let n = grid.nodes();
     let at = |i: [usize; 3]| (i[2] * n[1] + i[1]) * n[0] + i[0];
-    let place =
-        |i: [usize; 3]| grid.low + Vec3::new(i[0] as f32, i[1] as f32, i[2] as f32) * grid.cell;
-    let nodes = |n: [usize; 3]| {
-        (0..n[2]).flat_map(move |z| (0..n[1]).flat_map(move |y| (0..n[0]).map(move |x| [x, y, z])))
-    };
-    let values: Vec<f32> = nodes(n).map(|i| field(place(i))).collect();
+    let place = |i: [usize; 3]| grid.place(i);
     let mut mesh = Mesh::default();
     let mut cell_vertex = vec![u32::MAX; values.len()];
     for i in nodes([n[0] - 1, n[1] - 1, n[2] - 1]) {

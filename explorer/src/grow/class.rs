@@ -3,16 +3,29 @@
 //! A rule asks on which side of a plane, carried along by a joint, the mean place of a region of
 //! the garment lies. A state's class holds one bit of each rule's answer. A merge that goes the
 //! implausible way costs a penalty: it ranks the queue and steers merges, and is never part of an
-//! error that is reported.
+//! error that is reported. One more bit is the watchdog's flag: merging into a flagged state costs
+//! more than any error.
 
 use cloth::{Rigid, Vec3};
 use protocol::PoseId;
 
 use crate::grid::{GridState, POSITION_STEP_M};
 use crate::scene::{CLASS_RULES_MAX, ClassRule, Scene};
+use crate::simulator::FrameQuality;
 
 /// A state's class: bit `i` is set where the `i`th rule's value is its second.
 pub type Class = u8;
+
+/// The class bit of states whose frame came out of bounds (see [`crate::watchdog`]).
+pub const FLAGGED: Class = 1 << CLASS_RULES_MAX;
+/// What merging into a flagged state costs (m): more than any error, so that it is done only where
+/// a pose has nothing better, and that such a merge is undone first.
+const FLAGGED_M: f32 = 1000.0;
+
+/// The class bit of a frame by its measures.
+pub fn flag(quality: &FrameQuality) -> Class {
+    if quality.frames_flagged > 0 { FLAGGED } else { 0 }
+}
 
 /// What merges between classes cost; see the module.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -31,7 +44,8 @@ impl Penalties {
             [bit(from, *rule), bit(to, *rule)] == *way && way[0] != way[1]
         };
         let crossed = self.0.iter().enumerate().filter(crossed);
-        crossed.map(|(_, (_, penalty_m))| penalty_m).sum::<f32>() + 0.0
+        let crossed = crossed.map(|(_, (_, penalty_m))| penalty_m).sum::<f32>() + 0.0;
+        if to & FLAGGED != 0 { crossed + FLAGGED_M } else { crossed }
     }
 }
 
@@ -154,5 +168,6 @@ mod tests {
             [(0, 1), (1, 0), (0, 0), (1, 1)].iter().map(|(a, b)| penalties.of(*a, *b)).collect();
         assert_eq!(costs, [1.5, 0.0, 0.0, 0.0]);
         assert!(Penalties::default().of(0, 1).abs() < 1e-9);
+        assert!(penalties.of(0, FLAGGED) >= 1000.0 && penalties.of(FLAGGED, 1) < 2.0);
     }
 }

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use protocol::{EdgeId, PoseId, StateId};
 
-use super::class::{Class, Classifier};
+use super::class::{self, Class, Classifier};
 use super::plan::{InitialJob, Plan};
 use super::similar::{Found, Similar};
 use super::states::StateFile;
@@ -130,8 +130,8 @@ pub fn initial(
             None => (Local::Known(start), &from),
         };
         let depth = outcome.states.len() as u32;
-        let state = simulate(context, simulator, state, (edge, depth), &mut outcome.quality)?;
-        let class = context.classifier.class(context.primary.edge(edge).to, &state);
+        let place = (edge, depth);
+        let (state, class) = simulate(context, simulator, state, place, &mut outcome.quality)?;
         if context.plan.is_tree(edge) {
             places.push((context.primary.edge(edge).to, depth));
         }
@@ -158,7 +158,7 @@ pub fn expand(
         edge: EdgeId(0),
         pose: start_pose,
         depth: 0,
-        class: context.classifier.class(start_pose, &state),
+        class: context.similar.class(start),
         state,
         interior: true,
     };
@@ -213,10 +213,10 @@ impl Tree {
     ) -> Result<usize, JobError> {
         let from = &self.nodes[parent];
         let depth = from.depth + 1;
-        let state = simulate(context, simulator, &from.state, (edge, depth), &mut self.quality)?;
+        let place = (edge, depth);
+        let (state, class) = simulate(context, simulator, &from.state, place, &mut self.quality)?;
         let pose = context.primary.edge(edge).to;
         let parent = Some(parent);
-        let class = context.classifier.class(pose, &state);
         self.nodes.push(Node { parent, edge, pose, depth, class, state, interior: false });
         Ok(self.nodes.len() - 1)
     }
@@ -322,13 +322,14 @@ enum Target {
     Node(usize),
 }
 
+/// The next state and its class.
 fn simulate(
     context: &Context<'_>,
     simulator: &mut dyn Simulator,
     state: &GridState,
     (edge, depth): (EdgeId, u32),
     quality: &mut FrameQuality,
-) -> Result<GridState, JobError> {
+) -> Result<(GridState, Class), JobError> {
     if context.abandon.load(Ordering::Relaxed) {
         return Err(JobError::Abandoned);
     }
@@ -341,5 +342,6 @@ fn simulate(
         return Err(failed(SimulateError(text)));
     }
     quality.add(&frame.quality);
-    Ok(frame.state)
+    let class = context.classifier.class(context.primary.edge(edge).to, &frame.state);
+    Ok((frame.state, class | class::flag(&frame.quality)))
 }

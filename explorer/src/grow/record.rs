@@ -160,6 +160,7 @@ impl Header {
             text("drape_frames", e.drape_frames.to_string()),
             text("rank_max", e.rank_max.to_string()),
             text("ground", e.ground.to_string()),
+            text("self_contact", e.self_contact.to_string()),
             text("metric", metric(scene)),
             text("classes", digest(&classes(scene))),
             text("simulator", simulator(scene)),
@@ -259,6 +260,7 @@ fn garment(scene: &Scene) -> Hasher {
         .integers(garment.name.bytes().map(u64::from))
         .floats(garment.positions.iter().flat_map(|v| v.to_array()))
         .integers(garment.triangles.iter().flatten().map(|i| u64::from(*i)))
+        .integers(garment.layers.iter().map(|layer| u64::from(*layer)))
         .integers(garment.attached.iter().map(|i| u64::from(*i)))
         .floats(
             [f.density, f.stretch, f.shear, f.bend, f.friction, f.drag, f.damping_s, f.offset]

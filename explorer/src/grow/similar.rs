@@ -145,6 +145,12 @@ impl Similar {
         &self.metric
     }
 
+    /// The class of a state that was added.
+    pub fn class(&self, state: StateId) -> Class {
+        let kept = self.kept.read().unwrap_or_else(PoisonError::into_inner);
+        kept.classes[state.index()]
+    }
+
     /// What merges between classes cost.
     pub fn penalties(&self) -> &Penalties {
         &self.penalties

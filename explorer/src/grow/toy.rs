@@ -68,6 +68,7 @@ pub fn scene(primary: PrimaryGraph, exploration: ExplorationSettings) -> Scene {
         name: "toy".into(),
         positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y],
         triangles: vec![[0, 1, 2]],
+        layers: vec![],
         attached: vec![],
         fabric: Fabric::default(),
     };
@@ -100,11 +101,13 @@ pub struct Toy {
     pub shrink: i32,
     /// Steps along this edge fail.
     pub broken: Option<EdgeId>,
+    /// Steps along this edge are flagged where the first vertex comes out on an odd place.
+    pub doubtful: Option<EdgeId>,
 }
 
 impl Toy {
     pub fn new(shrink: i32) -> Self {
-        Self { shrink, broken: None }
+        Self { shrink, broken: None, doubtful: None }
     }
 }
 
@@ -138,6 +141,7 @@ impl Simulator for Toy {
             frames: 1,
             vertex_frames: 3,
             stretch_max: f32::from(next.positions[0][0].unsigned_abs()) * 1e-5,
+            frames_flagged: u64::from(self.doubtful == Some(edge) && next.positions[0][0] & 1 == 1),
             ..FrameQuality::default()
         };
         Ok(Frame { state: next, quality })

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use protocol::StateId;
 
-use super::class::{Class, Classifier};
+use super::class::{self, Class, Classifier};
 use super::files;
 use super::graph::{Graph, Kind};
 use super::job::{Local, LocalFrame, Outcome, Rules};
@@ -210,7 +210,7 @@ impl Work {
     /// The folder cannot be written.
     pub fn drape(&mut self, frame: &Frame) -> Result<(), WorkError> {
         let pose = self.graph().state(StateId(0)).pose;
-        let class = self.classifier.class(pose, &frame.state);
+        let class = self.classifier.class(pose, &frame.state) | class::flag(&frame.quality);
         self.write_states(StateId(0), std::slice::from_ref(&frame.state), &[class])?;
         self.record(&Record::Drape(DrapeRecord { quality: frame.quality, class }))
     }
@@ -381,16 +381,18 @@ impl Work {
     ) -> io::Result<Vec<MergeRecord>> {
         let graph = self.graph();
         let start = self.states.read(record.start)?;
-        let mut interior = vec![(graph.state(record.start).pose, record.start, &start)];
+        let from = graph.state(record.start);
+        let mut interior = vec![((from.pose, from.class), record.start, &start)];
         for ((frame, state), id) in record.frames.iter().zip(&outcome.states).zip(first..) {
             if frame.merge.is_none() {
-                interior.push((graph.primary().edge(frame.edge).to, StateId(id), state));
+                let pose = graph.primary().edge(frame.edge).to;
+                interior.push(((pose, frame.class), StateId(id), state));
             }
         }
-        interior.sort_by_key(|(pose, id, _)| (*pose, *id));
+        interior.sort_by_key(|((pose, _), id, _)| (*pose, *id));
         let mut remerges = Vec::new();
-        for group in interior.chunk_by(|a, b| a.0 == b.0) {
-            for &dead_end in graph.dead_ends(group[0].0) {
+        for group in interior.chunk_by(|a, b| a.0.0 == b.0.0) {
+            for &dead_end in graph.dead_ends(group[0].0.0) {
                 if dead_end != record.start {
                     remerges.extend(self.nearer_target(dead_end, group)?);
                 }
@@ -403,7 +405,7 @@ impl Work {
     fn nearer_target(
         &self,
         dead_end: StateId,
-        candidates: &[(protocol::PoseId, StateId, &GridState)],
+        candidates: &[((protocol::PoseId, Class), StateId, &GridState)],
     ) -> io::Result<Option<MergeRecord>> {
         let (mut cost_m, mut best) = (self.graph().cost_m(dead_end), None);
         let similar = &self.similar;
@@ -413,8 +415,7 @@ impl Work {
         }
         let frame = self.states.read(dead_end)?;
         let class = self.graph().state(dead_end).class;
-        for &(pose, target, state) in candidates {
-            let other = self.classifier.class(pose, state);
+        for &((_, other), target, state) in candidates {
             let penalty_m = similar.penalties().of(class, other);
             let near = similar.judge((&frame, state), penalty_m, cost_m);
             if let Some((error_m, nearer_m)) = near.filter(|(_, nearer_m)| *nearer_m < cost_m) {

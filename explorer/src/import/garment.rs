@@ -84,6 +84,9 @@ pub enum GarmentError {
         /// What is wrong.
         problem: String,
     },
+    /// A piece that could not be made.
+    #[error(transparent)]
+    Tailor(#[from] crate::tailor::TailorError),
     /// An attachment.
     #[error("attach[{index}]: {problem}")]
     Attach {

@@ -1,7 +1,8 @@
 //! Reads scenes: characters, motion graphs and garments in other people's formats.
 //!
-//! [`load_scene`] is the door: `robe` is made by [`crate::builtin`], `dress` is shipped as TOML
-//! and reads the data folder, anything else is a scene file ([`scene_file`]).
+//! [`load_scene`] is the door: `robe` is made by [`crate::builtin`]; `dress`, `robe-real`, `casual`,
+//! `layers` and `coat` are shipped as TOML and read the data folder; anything else is a scene file
+//! ([`scene_file`]).
 
 pub mod align;
 mod animation;
@@ -12,6 +13,7 @@ pub mod components;
 pub mod compute;
 pub mod garment;
 pub mod gltf_file;
+mod layers;
 mod metric;
 pub mod motion_graph;
 pub mod obj;
@@ -32,13 +34,12 @@ pub mod transition;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use cloth::Skeleton;
 use protocol::PoseId;
 
 use self::bvh::{Bvh, BvhError};
 use self::character::{Character, CharacterError};
 use self::compute::{ComputeError, Density};
-use self::garment::{GarmentError, Surface};
+use self::garment::GarmentError;
 use self::gltf_file::FILE_BYTES_MAX;
 use self::motion_graph::{GraphFile, GraphReport, MotionGraphError};
 use self::scene_file::{MotionSource, SceneFile, SceneFileError, resolve_path};
@@ -47,10 +48,15 @@ use crate::builtin::BuiltinError;
 use crate::primary::PrimaryGraph;
 use crate::scene::{Garment, MetricSettings, Scene};
 
-/// The TOML of the scene `dress`.
-const DRESS: &str = include_str!("../../../scenes/dress.toml");
-/// The TOML of the scene `dress-agile`.
-const DRESS_AGILE: &str = include_str!("../../../scenes/dress-agile.toml");
+/// Scenes that are shipped as TOML and read the data folder, by name.
+const SHIPPED: [(&str, &str); 6] = [
+    ("dress", include_str!("../../../scenes/dress.toml")),
+    ("dress-agile", include_str!("../../../scenes/dress-agile.toml")),
+    ("layers", include_str!("../../../scenes/layers.toml")),
+    ("robe-real", include_str!("../../../scenes/robe-real.toml")),
+    ("casual", include_str!("../../../scenes/casual.toml")),
+    ("coat", include_str!("../../../scenes/coat.toml")),
+];
 
 /// Why a scene could not be loaded: always the file, the place in it and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -128,7 +134,7 @@ pub struct Loaded {
     pub graph: Option<GraphReport>,
 }
 
-/// Loads a scene by name (`robe`, `dress`) or from a file.
+/// Loads a scene by name (`robe`, or one that is shipped as TOML) or from a file.
 ///
 /// * `data_dir`: the data folder, for `dress` and for `$TOILE_DATA` in files (see [`data_dir`]).
 ///
@@ -217,10 +223,8 @@ pub fn scene_graph(
 
 /// The text of a scene file and where it lies.
 fn scene_text(name_or_path: &str) -> Result<(String, PathBuf), SceneError> {
-    for (name, text) in [("dress", DRESS), ("dress-agile", DRESS_AGILE)] {
-        if name_or_path == name {
-            return Ok((text.to_owned(), PathBuf::from(format!("scenes/{name}.toml"))));
-        }
+    if let Some((name, text)) = SHIPPED.iter().find(|(name, _)| *name == name_or_path) {
+        return Ok(((*text).to_owned(), PathBuf::from(format!("scenes/{name}.toml"))));
     }
     let path = PathBuf::from(name_or_path);
     let text = String::from_utf8(read(&path, "the command line")?).map_err(|_| {
@@ -380,37 +384,17 @@ fn load_garment(
     options: LoadOptions,
 ) -> Result<(Garment, MetricSettings), SceneError> {
     let table = file.garment().map_err(|e| place.error(e))?;
-    let path = place.resolve("garment.file", &table.file)?;
-    let bytes = read(&path, "garment.file")?;
-    let attachments = table.attachments().map_err(|e| place.error(e))?;
-    let make = || {
-        let mut surface = Surface::read(&path, &bytes)?;
-        check::check_mesh(&surface.positions, &surface.triangles)?;
-        let file_vertices = surface.positions.len();
-        if let Some(vertices) = options.vertices.or(table.vertices) {
-            surface.refine_to(vertices)?;
-        } else if let Some(edge_length_m) = table.edge_length_m {
-            surface.refine(edge_length_m)?;
-        }
-        let skeleton = &character.body.skeleton;
-        let attached = surface.attach(&attachments, skeleton, file_vertices)?;
-        check::check_garment(&character.body, &surface.positions, &surface.triangles)?;
-        Ok((surface, attached, file_vertices))
-    };
-    let (surface, attached, file_vertices) =
-        make().map_err(|source| SceneError::Garment { path: path.clone(), source })?;
-    let metric = metric::resolve(file, &table, (&surface, file_vertices), skeleton_of(character))
-        .map_err(|e| place.error(e))?;
+    let dressed = layers::dress(&table, options.vertices, character, place)?;
+    let cut = (&dressed.surface, dressed.file_vertices);
+    let metric =
+        metric::resolve(file, &table, cut, &character.body.skeleton).map_err(|e| place.error(e))?;
     let garment = Garment {
         name: table.name.clone().unwrap_or_else(|| file.name.clone()),
-        positions: surface.positions,
-        triangles: surface.triangles,
-        attached,
+        positions: dressed.surface.positions,
+        triangles: dressed.surface.triangles,
+        layers: dressed.layers,
+        attached: dressed.attached,
         fabric: table.fabric().map_err(|e| place.error(e))?,
     };
     Ok((garment, metric))
-}
-
-fn skeleton_of(character: &Character) -> &Skeleton {
-    &character.body.skeleton
 }

@@ -44,6 +44,8 @@ use super::metric::{ClassTable, MetricTable};
 use crate::pipe::Foreign;
 use crate::scene::{ExplorationSettings, Fabric};
 
+/// Layers that a garment may have.
+pub const LAYERS_MAX: usize = 16;
 /// Frames per second that a scene may have.
 pub const FPS: [f32; 2] = [5.0, 240.0];
 
@@ -145,8 +147,13 @@ enum OneOrMany {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GarmentTable {
-    /// OBJ, glTF or GLB, in the character's rest pose.
-    pub file: String,
+    /// OBJ, glTF or GLB, in the character's rest pose ...
+    pub file: Option<String>,
+    /// ... or the name of a piece that is made for the character (see [`crate::tailor`]) ...
+    pub made: Option<String>,
+    /// ... or several of these, worn over each other, the innermost first.
+    #[serde(default)]
+    pub layers: Vec<LayerTable>,
     /// Name in the world.
     pub name: Option<String>,
     /// Longest edge after refinement (m).
@@ -162,6 +169,19 @@ pub struct GarmentTable {
     /// The cloth.
     #[serde(default)]
     pub material: MaterialTable,
+}
+
+/// A layer of a garment.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LayerTable {
+    /// OBJ, glTF or GLB, in the character's rest pose ...
+    pub file: Option<String>,
+    /// ... or the name of a piece that is made for the character.
+    pub made: Option<String>,
+    /// What is held to the body.
+    #[serde(default)]
+    pub attach: Vec<AttachTable>,
 }
 
 /// One of `loop_near`, `near` with `within_m`, `vertices`.
@@ -268,7 +288,7 @@ impl SceneFile {
         if garment.vertices.is_some() && garment.edge_length_m.is_some() {
             return Err(value("garment", "give edge_length_m or vertices, not both"));
         }
-        garment.attachments()?;
+        garment.pieces()?;
         Ok(garment)
     }
 
@@ -374,6 +394,37 @@ impl GarmentTable {
             damping_s: field("damping_s", m.damping_s, default.damping_s, [0.0, 1.0])?,
             offset: field("offset", m.offset, default.offset, [0.0, 0.1])?,
         })
+    }
+
+    /// The layers, the innermost first; a garment of one piece has one.
+    ///
+    /// # Errors
+    /// None or several of `file`, `made`, `layers`; an attachment of no kind.
+    pub fn pieces(&self) -> Result<Vec<LayerTable>, SceneFileError> {
+        let single = LayerTable {
+            file: self.file.clone(),
+            made: self.made.clone(),
+            attach: self.attach.clone(),
+        };
+        let pieces = match (&self.file, &self.made, self.layers.is_empty()) {
+            (Some(_), None, true) | (None, Some(_), true) => vec![single],
+            (None, None, false) if self.attach.is_empty() => self.layers.clone(),
+            (None, None, false) => {
+                return Err(value("garment.attach", "give each of the layers its own"));
+            }
+            _ => return Err(value("[garment]", "give exactly one of file, made and layers")),
+        };
+        if pieces.len() > LAYERS_MAX {
+            return Err(value("garment.layers", &format!("at most {LAYERS_MAX} are possible")));
+        }
+        for (index, piece) in pieces.iter().enumerate() {
+            if piece.file.is_some() == piece.made.is_some() {
+                let key = format!("garment.layers[{index}]");
+                return Err(value(&key, "give exactly one of file and made"));
+            }
+            attachments("garment.attach", &piece.attach)?;
+        }
+        Ok(pieces)
     }
 
     /// Attachments, each of one kind.

@@ -1,7 +1,9 @@
 //! Straight simulation: a garment along a walk, frame after frame, without a graph.
 //!
-//! [`Straight`] walks, [`Tally`] adds up what was measured.
+//! [`Straight`] walks, [`Tally`] adds up what was measured, [`converge`] compares finer steps and
+//! meshes.
 
+pub mod converge;
 mod tally;
 
 use cloth::{Mesh, Pose, Rigid, Vec3};

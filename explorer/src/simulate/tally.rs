@@ -10,6 +10,8 @@ use crate::simulator::FrameQuality;
 const BIN: f32 = 1e-4;
 const STRAINS: [f32; 2] = [-0.2, 0.3];
 const BINS: usize = 5000;
+/// A frame is slow beyond this many medians.
+const SLOW: f64 = 10.0;
 
 /// Adds up steps.
 #[derive(Debug, Clone)]
@@ -56,6 +58,8 @@ pub struct Sum {
     pub frames_retried: u64,
     /// Frames that came out of bounds all the same.
     pub frames_flagged: u64,
+    /// Frames that took more than ten times the median.
+    pub frames_slow: u64,
     /// Substeps of a frame, on average.
     pub substeps_mean: f64,
     /// Iterations of conjugate gradients of a frame, on average.
@@ -92,10 +96,12 @@ impl Tally {
         sorted.sort_unstable_by(f64::total_cmp);
         let share = |part: u64| part as f64 / q.vertex_frames.max(1) as f64;
         let mean = |sum: u64| sum as f64 / q.frames.max(1) as f64;
+        let median = quantile(&sorted, 0.5);
+        let slow = sorted.iter().filter(|s| **s > SLOW * median).count() as u64;
         Sum {
             frames: q.frames,
             cpu_s: sorted.iter().sum(),
-            cpu_s_median: quantile(&sorted, 0.5),
+            cpu_s_median: median,
             cpu_s_p90: quantile(&sorted, 0.9),
             cpu_s_p99: quantile(&sorted, 0.99),
             cpu_s_max: quantile(&sorted, 1.0),
@@ -110,6 +116,7 @@ impl Tally {
             speed_max_m_s: q.speed_max_m_s,
             frames_retried: q.frames_retried,
             frames_flagged: q.frames_flagged,
+            frames_slow: slow,
             substeps_mean: mean(q.substeps),
             iterations_mean: mean(q.iterations),
         }

@@ -119,6 +119,7 @@ pub fn scene() -> Scene {
         name: "sheet".into(),
         positions: (0..VERTICES).map(at).collect(),
         triangles: (0..VERTICES as u32 - 2).map(|i| [i, i + 1, i + 2]).collect(),
+        layers: vec![],
         attached: vec![],
         fabric: Fabric::default(),
     };
