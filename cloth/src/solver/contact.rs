@@ -96,11 +96,6 @@ impl Near {
         self.found && !self.pinched && self.distance < -depth
     }
 
-    /// Whether the vertex is so deep in the body that getting out comes first.
-    pub(crate) fn is_buried(&self) -> bool {
-        self.found && (self.pinched || self.distance < -PINCH_DEPTH_M)
-    }
-
     /// Measures the distance to the plane again after the vertex moved to `point`.
     pub(crate) fn moved(&mut self, surface: &Surface, posed: &Posed, point: Vec3) {
         if self.found {

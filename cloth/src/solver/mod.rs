@@ -305,9 +305,7 @@ impl Workspace {
             if self.self_contact.is_tangled() {
                 self.self_contact.find_tangles(model, &self.x);
             }
-            let apart =
-                self.near.iter().zip(&self.recovery.led).map(|(n, led)| *led || n.is_buried());
-            self.self_contact.set_off(model, apart);
+            self.self_contact.mark_tangles(model);
             self.self_contact.find(model, &self.x, &self.dx);
         }
     }

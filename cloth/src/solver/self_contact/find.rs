@@ -29,7 +29,7 @@ impl SelfContact {
             search.edges(i, j, &mut pairs);
         });
         self.fit = fit;
-        pairs.retain(|p| !self.is_off(p));
+        pairs.retain(|p| !self.may_pass(p));
         self.pairs = pairs;
     }
 }

@@ -17,8 +17,11 @@
 //! pushed apart; what fails still moves on as one piece, without relative motion. Only relative
 //! motion is ever bounded: what moves together goes as far as it likes.
 //!
-//! A pair of which a vertex is held between body parts, is led home, or lies at a place where the
-//! cloth crosses itself already, is left alone: `untangle` works on the last.
+//! Where the cloth crosses itself already, the pairs all of whose vertices belong to edges and
+//! triangles that cut each other may pass, and those with one such vertex do not repel, so that
+//! `untangle` can work there and what is whole around stays so. Vertices that are held between
+//! body parts or led home keep off other cloth as all do: layers that are pressed between an arm
+//! and the chest stay apart in the middle, and are in order when they come free.
 
 mod bound;
 mod find;
@@ -44,7 +47,7 @@ const FLOOR_M: f32 = 2.5e-4;
 pub(crate) struct SelfContact {
     fit: Fit,
     pub(crate) pairs: Vec<Pair>,
-    /// Vertices whose pairs are left alone.
+    /// Vertices of edges and triangles that cut each other.
     off: Vec<bool>,
     /// The ways for which the pairs were listed (m).
     listed: Vec<Vec3A>,
@@ -68,10 +71,10 @@ impl SelfContact {
         !self.crossings.is_empty()
     }
 
-    /// Marks the vertices whose pairs are left alone in this substep: `apart` and tangled ones.
-    pub(crate) fn set_off(&mut self, model: &Model, apart: impl Iterator<Item = bool>) {
+    /// Marks the vertices of edges and triangles that cut each other.
+    pub(crate) fn mark_tangles(&mut self, model: &Model) {
         self.off.clear();
-        self.off.extend(apart);
+        self.off.resize(model.mesh.vertex_count(), false);
         for c in &self.crossings {
             let triangle = model.mesh.triangles()[c.triangle as usize];
             for v in c.edge.iter().chain(&triangle) {
@@ -80,7 +83,13 @@ impl SelfContact {
         }
     }
 
-    fn is_off(&self, pair: &Pair) -> bool {
+    /// Whether a pair is in the middle of a tangle: it may pass.
+    fn may_pass(&self, pair: &Pair) -> bool {
+        pair.vertices.iter().all(|v| self.off[*v as usize])
+    }
+
+    /// Whether a pair is near a tangle, where repulsion would not know its side.
+    fn is_calm(&self, pair: &Pair) -> bool {
         pair.vertices.iter().any(|v| self.off[*v as usize])
     }
 

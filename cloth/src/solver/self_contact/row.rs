@@ -52,7 +52,7 @@ impl SelfContact {
         matrix: &mut Matrix,
         force: &mut [Vec3A],
     ) {
-        for pair in &self.pairs {
+        for pair in self.pairs.iter().filter(|p| !self.is_calm(p)) {
             let from = pass.x[pair.vertices[0] as usize];
             let start = pair.gather(from, pass.x);
             let way = pair.vertices.map(|v| pass.way[v as usize]);
