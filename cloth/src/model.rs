@@ -73,6 +73,8 @@ pub struct Model {
     pub(crate) pattern: Pattern,
     /// Over the garment's triangles.
     pub(crate) tree: Tree,
+    /// Layer of each vertex, counted outwards; empty where all are one.
+    pub(crate) layers: Vec<u8>,
     /// Bending energy's Hessian, in the pattern's layout (N/m).
     pub(crate) bending: bending::Stiffness,
 }
@@ -105,6 +107,14 @@ pub enum ModelError {
     Attached {
         /// The vertex.
         vertex: u32,
+        /// Number of vertices.
+        count: usize,
+    },
+    /// Layers were not given for every vertex.
+    #[error("{given} layers are given for {count} vertices; give each vertex one")]
+    Layers {
+        /// How many were given.
+        given: usize,
         /// Number of vertices.
         count: usize,
     },
@@ -150,12 +160,28 @@ impl Model {
             held_edges,
             homes,
             tree: Tree::new(&mesh),
+            layers: Vec::new(),
             pattern,
             mesh,
             material,
             environment,
             body,
         })
+    }
+
+    /// The same garment worn in layers: `layers` says for each vertex to which it belongs, counted
+    /// outwards. Where two layers meet, the outer one is led to the side to which the inner one's
+    /// triangles are turned, also if it starts on the other.
+    ///
+    /// # Errors
+    /// Not one layer per vertex.
+    pub fn with_layers(mut self, layers: Vec<u8>) -> Result<Self, ModelError> {
+        let (given, count) = (layers.len(), self.mesh.vertex_count());
+        if given != count {
+            return Err(ModelError::Layers { given, count });
+        }
+        self.layers = layers;
+        Ok(self)
     }
 
     /// The garment's mesh.

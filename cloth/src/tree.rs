@@ -147,6 +147,11 @@ impl Tree {
         }
     }
 
+    /// Unit normal of the cloth around a vertex, between beginning and end.
+    pub(crate) fn vertex_normal(fit: &Fit, vertex: u32) -> Vec3A {
+        fit.around[vertex as usize].0
+    }
+
     /// Finds the vertices around which the cloth is smooth before and after.
     fn fit_fans(&self, fit: &mut Fit) {
         fit.around.clear();

@@ -10,6 +10,7 @@
 //! were measured.
 
 mod bending;
+mod contact;
 mod drape;
 mod energy;
 mod fall;
@@ -168,6 +169,7 @@ pub const BENCHES: &[Bench] = &[
     fall::A1, hang::A2, swing::A3, swing::A4, hang::A5, bending::A6, bending::A7, drape::A8,
     fall::A9, slide::A10, momentum::A12, energy::A13,
     sheets::B1, sheets::B2, sweep::B3, mesh_faults::B4,
+    contact::C1, contact::C2, contact::C3, contact::C4, contact::C5, contact::C6,
     soak::D1, repeat::D2, repeat::D3, speed::D4,
     sheets::S1, sheets::S2,
 ];

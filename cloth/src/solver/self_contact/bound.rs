@@ -84,7 +84,7 @@ impl SelfContact {
     ) -> bool {
         for _ in 0..SWEEPS {
             let mut clear = !done.moved || limit::settle(&model.mesh, inverse_masses, ends);
-            for pair in &self.pairs {
+            for pair in self.pairs.iter().filter(|p| !p.wrong) {
                 let from = x[pair.vertices[0] as usize];
                 let (a, b) = (pair.gather(from, x), pair.gather(from, ends));
                 let floor = pair.floor();
@@ -129,7 +129,7 @@ impl SelfContact {
         let mut lost = 0;
         for _ in 0..ROUNDS {
             lost = 0;
-            for pair in &self.pairs {
+            for pair in self.pairs.iter().filter(|p| !p.wrong) {
                 let from = x[pair.vertices[0] as usize];
                 let (a, b) = (pair.gather(from, x), pair.gather(from, ends));
                 if !pair.is_clear(&a, &b, pair.floor()) {

@@ -5,11 +5,14 @@ use glam::Vec3A;
 use super::SelfContact;
 use super::pair::{Closest, Pair};
 use crate::model::Model;
-use crate::tree::Tree;
+use crate::tree::{Fit, Tree};
 
 /// Share of a pair's distance in the rest shape at which it repels at most: parts of a smooth cloth
 /// are no contact.
 const REST_SHARE: f32 = 0.5;
+/// An outer layer is on the wrong side where the cosine between the way to it and the inner one's
+/// normal is less than this: what lies beside a rim is on neither.
+const WRONG_SIDE: f32 = -0.3;
 
 impl SelfContact {
     /// Lists the pairs whose distance at `x`, less their parts' relative `way`, is within reach.
@@ -24,9 +27,9 @@ impl SelfContact {
         tree.fit(|v| x[v as usize], |v| way[v as usize], &mut fit);
         let search = Search { model, tree, x, way, reach };
         tree.pairs(&mut fit, reach, true, |fit, i, j| {
-            search.faces(i, j, fit.normals[j as usize][0], &mut pairs);
-            search.faces(j, i, fit.normals[i as usize][0], &mut pairs);
-            search.edges(i, j, &mut pairs);
+            search.faces(fit, i, j, &mut pairs);
+            search.faces(fit, j, i, &mut pairs);
+            search.edges(fit, i, j, &mut pairs);
         });
         self.fit = fit;
         pairs.retain(|p| !self.may_pass(p));
@@ -44,7 +47,8 @@ struct Search<'a> {
 
 impl Search<'_> {
     /// The vertices that belong to slot `of` against the face of slot `against`.
-    fn faces(&self, of: u32, against: u32, normal: Vec3A, out: &mut Vec<Pair>) {
+    fn faces(&self, fit: &Fit, of: u32, against: u32, out: &mut Vec<Pair>) {
+        let normal = fit.normals[against as usize][0];
         let face = self.tree.corners[against as usize];
         let owns = self.tree.owns[of as usize];
         for (k, v) in self.tree.corners[of as usize].into_iter().enumerate() {
@@ -57,13 +61,13 @@ impl Search<'_> {
             let relative = apart(face[0]).max(apart(face[1])).max(apart(face[2])).sqrt();
             let most = self.reach + relative;
             if normal.dot(p - self.x[face[0] as usize]).abs() <= most {
-                self.add(vertices, false, most, out);
+                self.add(fit, vertices, false, most, out);
             }
         }
     }
 
     /// The edges that belong to one slot against those that belong to the other.
-    fn edges(&self, i: u32, j: u32, out: &mut Vec<Pair>) {
+    fn edges(&self, fit: &Fit, i: u32, j: u32, out: &mut Vec<Pair>) {
         let sides = |slot: u32| {
             let (corners, owns) = (self.tree.corners[slot as usize], self.tree.owns[slot as usize]);
             (0..3usize)
@@ -87,12 +91,12 @@ impl Search<'_> {
                 if below.max(above).max_element() > most {
                     continue;
                 }
-                self.add([a[0], a[1], b[0], b[1]], true, most, out);
+                self.add(fit, [a[0], a[1], b[0], b[1]], true, most, out);
             }
         }
     }
 
-    fn add(&self, vertices: [u32; 4], edges: bool, most: f32, out: &mut Vec<Pair>) {
+    fn add(&self, fit: &Fit, vertices: [u32; 4], edges: bool, most: f32, out: &mut Vec<Pair>) {
         let from = self.x[vertices[0] as usize];
         let c = Closest::of(edges, &vertices.map(|v| self.x[v as usize] - from));
         let distance = c.across.length();
@@ -102,6 +106,23 @@ impl Search<'_> {
         let rest = self.model.mesh.rest_positions();
         let rest = Closest::of(edges, &vertices.map(|v| Vec3A::from(rest[v as usize])));
         let keep = self.model.material.offset.min(REST_SHARE * rest.across.length());
-        out.push(Pair { vertices, edges, normal: c.across / distance, distance, keep });
+        let normal = c.across / distance;
+        let wrong = self.is_wrong(fit, &vertices, edges, normal);
+        out.push(Pair { vertices, edges, normal, distance, keep, wrong });
+    }
+
+    /// Whether the outer one of two layers lies inside the inner one.
+    fn is_wrong(&self, fit: &Fit, vertices: &[u32; 4], edges: bool, normal: Vec3A) -> bool {
+        let layer = |v: u32| self.model.layers.get(v as usize).copied().unwrap_or(0);
+        let (first, second) = (layer(vertices[0]), layer(vertices[3]));
+        if first == second {
+            return false;
+        }
+        let around = |v: &u32| Tree::vertex_normal(fit, *v);
+        let (own, others) = vertices.split_at(if edges { 2 } else { 1 });
+        let inner = if first > second { others } else { own };
+        let outwards: Vec3A = inner.iter().map(around).sum();
+        let to_outer = if first > second { normal } else { -normal };
+        to_outer.dot(outwards.normalize_or_zero()) < WRONG_SIDE
     }
 }

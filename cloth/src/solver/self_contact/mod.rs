@@ -21,7 +21,8 @@
 //! triangles that cut each other may pass, and those with one such vertex do not repel, so that
 //! `untangle` can work there and what is whole around stays so. Vertices that are held between
 //! body parts or led home keep off other cloth as all do: layers that are pressed between an arm
-//! and the chest stay apart in the middle, and are in order when they come free.
+//! and the chest stay apart in the middle, and are in order when they come free. Of two layers in the
+//! wrong order the outer one is led through the inner one, at a bounded speed.
 
 mod bound;
 mod find;
@@ -85,7 +86,7 @@ impl SelfContact {
 
     /// Whether a pair is in the middle of a tangle: it may pass.
     fn may_pass(&self, pair: &Pair) -> bool {
-        pair.vertices.iter().all(|v| self.off[*v as usize])
+        !pair.wrong && pair.vertices.iter().all(|v| self.off[*v as usize])
     }
 
     /// Whether a pair is near a tangle, where repulsion would not know its side.

@@ -19,6 +19,8 @@ pub(crate) struct Pair {
     pub(crate) distance: f32,
     /// Distance at which they begin to repel each other (m).
     pub(crate) keep: f32,
+    /// Whether an outer layer lies inside an inner one here: the pair may pass, and is led to.
+    pub(crate) wrong: bool,
 }
 
 /// The closest points of a pair.
@@ -120,7 +122,14 @@ mod tests {
     fn pair(edges: bool, x: &[Vec3A; 4]) -> Pair {
         let c = Closest::of(edges, x);
         let distance = c.across.length();
-        Pair { vertices: [0, 1, 2, 3], edges, normal: c.across / distance, distance, keep: 4e-3 }
+        Pair {
+            vertices: [0, 1, 2, 3],
+            edges,
+            normal: c.across / distance,
+            distance,
+            keep: 4e-3,
+            wrong: false,
+        }
     }
 
     #[test]

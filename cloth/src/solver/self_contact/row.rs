@@ -11,6 +11,8 @@ use crate::solver::matrix::Matrix;
 const STIFFNESS: f32 = 1000.0;
 /// What is too near parts no faster than this (m/s).
 const CORRECTION_M_S: f32 = 0.25;
+/// An outer layer on the wrong side of an inner one goes through it at this speed (m/s).
+const REORDER_M_S: f32 = 0.5;
 /// Slip at which Coulomb's force is reached (m/s).
 const STICK_M_S: f32 = 1e-3;
 
@@ -52,13 +54,18 @@ impl SelfContact {
         matrix: &mut Matrix,
         force: &mut [Vec3A],
     ) {
-        for pair in self.pairs.iter().filter(|p| !self.is_calm(p)) {
+        for pair in self.pairs.iter().filter(|p| p.wrong || !self.is_calm(p)) {
             let from = pass.x[pair.vertices[0] as usize];
             let start = pair.gather(from, pass.x);
             let way = pair.vertices.map(|v| pass.way[v as usize]);
             let end = std::array::from_fn(|k| start[k] + way[k]);
             let (shares, normal) = pair.side(&start, &end);
-            let keep = pair.keep.min(pair.distance.max(FLOOR_M) + CORRECTION_M_S * pass.dt);
+            let (normal, keep) = if pair.wrong {
+                (-pair.normal, REORDER_M_S * pass.dt - pair.distance)
+            } else {
+                let most = pair.distance.max(FLOOR_M) + CORRECTION_M_S * pass.dt;
+                (normal, pair.keep.min(most))
+            };
             let gap = normal.dot(mix(&shares, &end)) - keep;
             if gap >= 0.0 {
                 continue;
@@ -83,6 +90,9 @@ impl Pair {
     /// Shares and normal of the row that keeps the pair on the side where it began: those at the
     /// end where it has not passed, else those of the beginning.
     fn side(&self, start: &[Vec3A; 4], end: &[Vec3A; 4]) -> ([f32; 4], Vec3A) {
+        if self.wrong {
+            return (Closest::of(self.edges, start).shares, self.normal);
+        }
         let there = Closest::of(self.edges, end);
         let distance = there.across.length();
         let same = self.normal.dot(there.across) > 0.0;

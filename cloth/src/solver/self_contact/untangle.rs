@@ -27,6 +27,10 @@ impl SelfContact {
         for i in 0..self.crossings.len() {
             let c = self.crossings[i];
             let triangle = model.mesh.triangles()[c.triangle as usize];
+            let layer = |v: u32| model.layers.get(v as usize).copied().unwrap_or(0);
+            if layer(c.edge[0]) != layer(triangle[0]) {
+                continue; // the layers' order tells more
+            }
             let Some((along, shares)) = gradient(model, c.edge, triangle, ends) else { continue };
             let vertices = [c.edge[0], c.edge[1], triangle[0], triangle[1], triangle[2]];
             let weight = |k: usize| inverse_masses[vertices[k] as usize] * shares[k].abs();
