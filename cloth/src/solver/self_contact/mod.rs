@@ -74,8 +74,10 @@ impl SelfContact {
 
     /// Marks the vertices of edges and triangles that cut each other.
     pub(crate) fn mark_tangles(&mut self, model: &Model) {
+        // Where crossings outnumber vertices no side is the right one: all may pass.
+        let hopeless = self.crossings.len() > model.mesh.vertex_count();
         self.off.clear();
-        self.off.resize(model.mesh.vertex_count(), false);
+        self.off.resize(model.mesh.vertex_count(), hopeless);
         for c in &self.crossings {
             let triangle = model.mesh.triangles()[c.triangle as usize];
             for v in c.edge.iter().chain(&triangle) {
