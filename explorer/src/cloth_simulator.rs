@@ -53,8 +53,12 @@ impl ClothSimulatorFactory {
             ..Environment::default()
         };
         let body = Some(scene.body.clone());
-        let model = Model::new(mesh, garment.fabric, environment, body, &garment.attached)
+        let mut model = Model::new(mesh, garment.fabric, environment, body, &garment.attached)
             .map_err(|e| refused(e.to_string()))?;
+        if !garment.layers.is_empty() {
+            let layers = garment.layers.clone();
+            model = model.with_layers(layers).map_err(|e| refused(e.to_string()))?;
+        }
         Ok(Self { scene: Arc::new(scene.clone()), model: Arc::new(model) })
     }
 
