@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 use explorer::grow::policy::Policy;
+use explorer::pack::Profile;
 
 /// Near-exhaustive precomputed cloth: explore, publish, stream, play.
 #[derive(Debug, Parser)]
@@ -46,6 +47,8 @@ pub enum Command {
     Lab(Lab),
     /// Measure the codec.
     Codec(Codec),
+    /// Draw bytes and milliseconds per frame against error, for every codec.
+    Chart(Chart),
 }
 
 /// `toile up`.
@@ -66,6 +69,12 @@ pub struct Up {
     /// Stop after this long, e.g. 60s, 5m [default: until Ctrl-C].
     #[arg(long = "for", value_name = "TIME", value_parser = duration)]
     pub time: Option<Duration>,
+    /// How states are encoded: toile or kim2013 [default: as the store has them, else toile].
+    #[arg(long, value_name = "PROFILE", value_parser = profile)]
+    pub codec: Option<Profile>,
+    /// Largest distance of any vertex from its simulated place, with --codec toile (mm).
+    #[arg(long, value_name = "MM", default_value_t = 15.0, allow_negative_numbers = true)]
+    pub bound_mm: f32,
     /// Simulation threads [default: all cores].
     #[arg(long)]
     pub workers: Option<usize>,
@@ -107,6 +116,12 @@ pub struct Explore {
     /// Stop after this long, e.g. 60s, 5m.
     #[arg(long = "for", value_name = "TIME", value_parser = duration)]
     pub time: Option<Duration>,
+    /// How states are encoded: toile or kim2013 [default: as the store has them, else toile].
+    #[arg(long, value_name = "PROFILE", value_parser = profile)]
+    pub codec: Option<Profile>,
+    /// Largest distance of any vertex from its simulated place, with --codec toile (mm).
+    #[arg(long, value_name = "MM", default_value_t = 15.0, allow_negative_numbers = true)]
+    pub bound_mm: f32,
     /// Simulation threads [default: all cores].
     #[arg(long)]
     pub workers: Option<usize>,
@@ -385,6 +400,26 @@ pub enum SceneCommand {
     },
 }
 
+/// `toile chart`.
+#[derive(Debug, Args)]
+pub struct Chart {
+    /// Object store: a folder or a URL.
+    #[arg(value_name = "STORE")]
+    pub store: String,
+    /// Where to write the files.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Work folder that it was explored in [default: beside a local store].
+    #[arg(long, value_name = "DIR")]
+    pub work: Option<PathBuf>,
+    /// At most so many states, whole regions spread evenly [default: all].
+    #[arg(long)]
+    pub states: Option<usize>,
+    /// What `toile codec bench --json` printed, instead of measuring again.
+    #[arg(long, value_name = "FILE.json")]
+    pub bench: Option<PathBuf>,
+}
+
 /// `toile codec`.
 #[derive(Debug, Args)]
 pub struct Codec {
@@ -499,6 +534,10 @@ pub struct LabRun {
 
 fn policy(text: &str) -> Result<Policy, String> {
     text.parse()
+}
+
+fn profile(text: &str) -> Result<Profile, String> {
+    Profile::named(text).ok_or_else(|| "toile or kim2013".into())
 }
 
 fn duration(text: &str) -> Result<Duration, String> {

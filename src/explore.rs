@@ -27,6 +27,8 @@ pub fn run(a: args::Explore) -> Result<()> {
     let work = place::work(&opened, a.work)?;
     let stop = Stop::on_signals()?.after(a.time);
     let options = ExploreOptions {
+        codec: a.codec,
+        bound: place::bound(a.bound_mm)?,
         workers: place::workers(a.workers)?,
         frames: a.frames,
         error_m: a.error.map(|mm| mm / 1000.0),

@@ -1,6 +1,7 @@
 //! `toile`: one binary for everything. This file parses and dispatches; each command has a module.
 
 mod args;
+mod chart;
 mod clock;
 mod codec;
 mod compare;
@@ -43,6 +44,7 @@ fn main() -> ExitCode {
         Command::Simulate(a) => simulate::run(&a),
         Command::Scene(a) => scene::run(a),
         Command::Lab(a) => lab::run(a),
+        Command::Chart(a) => chart::run(&a),
         Command::Codec(a) => match a.command {
             args::CodecCommand::DecodeBench(a) => decode_bench::run(&a),
             args::CodecCommand::Bench(a) => codec::bench(&a),

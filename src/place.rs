@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
+use explorer::pack::Bound;
 
 use crate::store::Opened;
 
@@ -43,6 +44,13 @@ pub fn ensure_writable(file: &Path) -> Result<()> {
         std::fs::remove_file(file).with_context(|| format!("removing {}", file.display()))?;
     }
     Ok(())
+}
+
+/// A bound on every vertex, from millimetres.
+pub fn bound(mm: f32) -> Result<Bound> {
+    let bound = Bound { max_m: Some(mm / 1000.0), rms_m: None };
+    ensure!(bound.is_valid(), "--bound-mm {mm}: millimetres, at least 0.01");
+    Ok(bound)
 }
 
 /// As many threads as asked, at least one; by default one per core.

@@ -66,6 +66,8 @@ pub fn run(a: &args::Up) -> Result<()> {
     let server = runtime.block_on(Server::start(config)).context("starting the server")?;
     eprintln!("scene {} into {store_place}", scene.name);
     let options = ExploreOptions {
+        codec: a.codec,
+        bound: place::bound(a.bound_mm)?,
         workers: place::workers(a.workers)?,
         policy: a.policy,
         best_prefix_at_end: false,

@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use codec::VertexFix;
 use protocol::{ChunkHash, StateId};
 
 /// Coefficients of consecutive states, as decoded: 16 bits each, in steps of full scale.
@@ -16,6 +17,8 @@ pub struct Region {
     state_count: usize,
     columns: usize,
     coefficients: Vec<i16>,
+    /// Vertices that are moved after reconstruction, by state.
+    fixes: Vec<VertexFix>,
     chunk_use: Arc<AtomicU64>,
 }
 
@@ -27,7 +30,13 @@ impl Region {
     pub fn new(first_state: StateId, columns: usize, coefficients: Vec<i16>) -> Self {
         assert!(columns > 0 && coefficients.len().is_multiple_of(columns), "whole rows");
         let state_count = coefficients.len() / columns;
-        Self { first_state, state_count, columns, coefficients, chunk_use: Arc::default() }
+        let (fixes, chunk_use) = (Vec::new(), Arc::default());
+        Self { first_state, state_count, columns, coefficients, fixes, chunk_use }
+    }
+
+    /// With vertices that are moved after reconstruction, sorted by state.
+    pub fn with_fixes(self, fixes: Vec<VertexFix>) -> Self {
+        Self { fixes, ..self }
     }
 
     /// Its first state.
@@ -42,7 +51,8 @@ impl Region {
 
     /// Memory held, in bytes.
     pub fn bytes(&self) -> usize {
-        size_of::<Self>() + 2 * self.coefficients.capacity()
+        let fixes = size_of::<VertexFix>() * self.fixes.capacity();
+        size_of::<Self>() + 2 * self.coefficients.capacity() + fixes
     }
 
     /// Whether a state lies here.
@@ -84,6 +94,15 @@ impl Resident {
         region.chunk_use.store(self.clock.fetch_add(1, Ordering::Relaxed) + 1, Ordering::Relaxed);
         region.expand((state.0 - region.first_state.0) as usize, out);
         true
+    }
+
+    /// Appends the vertices of a state that are moved after reconstruction, and by how much (m).
+    pub fn fixes(&self, state: StateId, out: &mut Vec<(u32, [f32; 3])>) {
+        let Some(region) = self.find(state) else { return };
+        let index = (state.0 - region.first_state.0) as usize;
+        let first = region.fixes.partition_point(|fix| usize::from(fix.state) < index);
+        let own = region.fixes[first..].iter().take_while(|fix| usize::from(fix.state) == index);
+        out.extend(own.map(|fix| (fix.vertex, fix.offset_m)));
     }
 
     fn find(&self, state: StateId) -> Option<&Region> {

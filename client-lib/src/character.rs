@@ -1,12 +1,11 @@
 //! One character that wears a garment: `step` once per scene tick, `sample` and `decode` as often
 //! as the screen asks.
 
-use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
 
 use cloth::{Pose, Rigid};
-use codec::{Basis, ReconstructError};
+use codec::Basis;
 use protocol::table::Follow;
 use protocol::{EdgeId, PoseId, StateId};
 
@@ -18,9 +17,13 @@ use crate::stats::PlayStats;
 use crate::telemetry::Batch;
 use crate::version::{Version, View};
 
+mod decode;
 mod look;
+mod overlay;
 
+pub use decode::decode;
 pub use look::Passed;
+use overlay::Overlay;
 
 /// A step that takes longer than this counts as missed (design decision 11).
 pub const STEP_LIMIT: Duration = Duration::from_millis(2);
@@ -77,6 +80,7 @@ pub struct Character {
     before: Vec<f32>,
     sampled: Vec<f32>,
     phase: f32,
+    overlay: Overlay,
     placement: Placement,
     placement_before: Placement,
     scratch: Scratch,
@@ -117,6 +121,7 @@ impl Character {
             before: vec![0.0; columns],
             sampled: vec![0.0; columns],
             phase: 1.0,
+            overlay: Overlay::default(),
             placement,
             placement_before: placement,
             scratch: Scratch::default(),
@@ -146,6 +151,7 @@ impl Character {
         let watch = Stopwatch::start();
         self.take_newer_view();
         std::mem::swap(&mut self.before, &mut self.now);
+        self.overlay.begin_frame();
         self.placement_before = self.placement;
         self.passed = None;
         let scene = Arc::clone(self.view.version.scene());
@@ -168,6 +174,7 @@ impl Character {
     /// [`Character::world_pose`] then speak of the same instant. After a step the phase is 1.
     pub fn sample(&mut self, phase: f32) -> &[f32] {
         self.phase = phase.clamp(0.0, 1.0);
+        self.overlay.sample(self.phase);
         for ((out, before), now) in self.sampled.iter_mut().zip(&self.before).zip(&self.now) {
             *out = before + (now - before) * self.phase;
         }
@@ -397,10 +404,11 @@ impl Character {
             return;
         }
         self.stats.switches += u64::from(old.version.number() != view.version.number());
-        if old.version.lineage() != view.version.lineage()
-            || self.placement.pose().index() >= view.version.scene().pose_count()
-        {
+        if self.placement.pose().index() >= view.version.scene().pose_count() {
             return self.start_over(&view);
+        }
+        if old.version.lineage() != view.version.lineage() {
+            return self.change_basis(&old, &view);
         }
         if let Shown::Substitute { state, error_m } = self.shown_by {
             // A substitute that this version merged or retired is looked for anew.
@@ -433,7 +441,44 @@ impl Character {
         self.scratch = scratch;
     }
 
-    /// Nothing of the old version means anything in this one: another basis or another motion.
+    /// The version stands on another basis: the cloth that was shown decays into that of the same
+    /// state, vertex by vertex, since no coefficient of the old basis means anything on the new.
+    fn change_basis(&mut self, old: &View, view: &View) {
+        let was = std::mem::take(&mut self.now);
+        let state = view.version.links().resume(self.state);
+        let pose = state.and_then(|state| view.version.links().pose(state));
+        let Some(state) = state.filter(|_| pose == Some(self.placement.pose())) else {
+            self.now = was;
+            return self.start_over(view);
+        };
+        self.blend.clear();
+        self.state = state;
+        self.base.fill(0.0);
+        self.shown_by = Shown::Last;
+        if view.resident.read(state, &mut self.base) {
+            self.shown_by = Shown::Named;
+        } else {
+            let mut scratch = std::mem::take(&mut self.scratch);
+            let links = view.version.links();
+            let mut states = links.interior(self.placement.pose()).iter().copied();
+            if let Some(near) = states.find(|near| view.resident.read(*near, &mut scratch.best)) {
+                self.base.copy_from_slice(&scratch.best);
+                self.shown_by = Shown::Substitute { state: near, error_m: 0.0 };
+            }
+            self.scratch = scratch;
+        }
+        let (from, to) = (old.version.basis(), view.version.basis());
+        let mut fixes = Vec::new();
+        if let Some(shown) = self.shown_state() {
+            view.resident.fixes(shown, &mut fixes);
+        }
+        let error_m = self.overlay.carry((from, &was), (to, &self.base), fixes);
+        self.blend.add_error(error_m);
+        self.now = was;
+        self.now.copy_from_slice(&self.base);
+    }
+
+    /// Nothing of the old version means anything in this one: another motion.
     fn start_over(&mut self, view: &View) {
         self.blend.clear();
         self.state = view.version.links().resume(StateId(0)).unwrap_or(StateId(0));
@@ -465,10 +510,24 @@ impl Character {
         positions.resize(self.view.version.basis().rows(), 0.0);
     }
 
+    /// The state whose coefficients are in `base`, where it is of this version.
+    fn shown_state(&self) -> Option<StateId> {
+        match self.shown_by {
+            Shown::Named => Some(self.state),
+            Shown::Substitute { state, .. } => Some(state),
+            Shown::Last => None,
+        }
+    }
+
     /// This frame: the shown state and what is left of all offsets.
     fn compose(&mut self) {
         self.now.copy_from_slice(&self.base);
         self.blend.apply(&mut self.now);
+        self.overlay.now.clear();
+        if let Some(shown) = self.shown_state() {
+            self.view.resident.fixes(shown, &mut self.overlay.now);
+        }
+        self.overlay.sample(1.0);
         self.sampled.copy_from_slice(&self.now);
         self.phase = 1.0;
     }
@@ -506,50 +565,6 @@ impl Character {
 impl Drop for Character {
     fn drop(&mut self) {
         self.stage.mailbox().try_post(&mut self.batch);
-    }
-}
-
-/// Positions of the sampled cloth of many characters, each in its own state frame.
-///
-/// * `rows`: which rows (x0, y0, z0, x1, ...; three per vertex).
-/// * `columns`: how many leading columns; fewer make a coarser state. More than there are means
-///   all of them.
-/// * `out`: `rows.len()` numbers (metres) per character, one after another.
-///
-/// A host calls this on its own threads. Characters that share a basis read it once for all.
-///
-/// # Errors
-/// Rows that a basis does not have, or an output of the wrong size.
-pub fn decode(
-    instances: &[&Character],
-    rows: Range<usize>,
-    columns: usize,
-    out: &mut [f32],
-) -> Result<(), ReconstructError> {
-    let Some(first) = instances.first() else { return Ok(()) };
-    let basis = first.view.version.basis();
-    if instances.len() > 1 && instances.iter().all(|c| c.shares(first)) {
-        let stride = first.sampled.len();
-        let all: Vec<f32> = instances.iter().flat_map(|c| c.sampled.iter().copied()).collect();
-        return basis.reconstruct_batch(&all, stride, rows, columns.min(basis.columns()), out);
-    }
-    let expected = instances.len() * rows.len();
-    if out.len() != expected {
-        return Err(ReconstructError::Output { expected, actual: out.len() });
-    }
-    for (character, out) in instances.iter().zip(out.chunks_exact_mut(rows.len().max(1))) {
-        let basis = character.view.version.basis();
-        let columns = columns.min(basis.columns());
-        basis.reconstruct(&character.sampled, rows.clone(), columns, out)?;
-    }
-    Ok(())
-}
-
-impl Character {
-    /// Whether both can be decoded in one pass.
-    fn shares(&self, other: &Self) -> bool {
-        Arc::ptr_eq(self.view.version.basis(), other.view.version.basis())
-            && self.sampled.len() == other.sampled.len()
     }
 }
 

@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use codec::{Basis, kim2013};
+use codec::{Basis, Decoder};
 use protocol::links::LinkPage;
 use protocol::manifest::{ChunkRef, GarmentVersion};
 use protocol::region::{RegionChunk, RegionEntry};
@@ -51,8 +51,8 @@ pub enum LoadError {
     },
     /// Encoded in a way that this client cannot read.
     #[error(
-        "garment \"{garment}\" is encoded as \"{found}\"; this client reads \"{}\": update it",
-        kim2013::PROFILE
+        "garment \"{garment}\" is encoded as \"{found}\"; this client reads {}: update it",
+        Decoder::PROFILES.join(", ")
     )]
     Profile {
         /// The garment's name.
@@ -131,11 +131,13 @@ pub struct GarmentLoader {
 struct PartsSoFar {
     scene: Option<(ChunkHash, Arc<Scene>)>,
     mesh: Option<(ChunkHash, Arc<GarmentChunk>)>,
-    basis: Option<(Vec<ChunkHash>, Arc<Basis>)>,
+    basis: Option<(Vec<ChunkHash>, Decoder, Arc<Basis>)>,
     /// Encoded generations that are not yet in `basis`.
     generations: BTreeMap<ChunkHash, Vec<u8>>,
     /// Encoded link pages, each read once on arrival.
     pages: BTreeMap<ChunkHash, Vec<u8>>,
+    /// Region chunks of the next version that need generations that are not yet in `basis`.
+    regions: BTreeMap<ChunkHash, (RegionChunk, bool)>,
 }
 
 impl GarmentLoader {
@@ -184,7 +186,7 @@ impl GarmentLoader {
         number: VersionNumber,
         garment: &GarmentVersion,
     ) -> Result<(), LoadError> {
-        if garment.codec != kim2013::PROFILE {
+        if Decoder::new(&garment.codec).is_none() {
             let (garment, found) = (garment.name.clone(), garment.codec.clone());
             return Err(LoadError::Profile { garment, found });
         }
@@ -250,7 +252,8 @@ impl GarmentLoader {
             let cache = self.next_cache.as_ref().unwrap_or(&self.cache);
             self.parts.lacking(next, |chunk| add(chunk, Need::Version));
             let initial = next.regions.iter().filter(|region| region.initial);
-            let lacking = initial.filter(|region| !cache.contains(&region.chunk.hash));
+            let here = |chunk| cache.contains(chunk) || self.parts.regions.contains_key(chunk);
+            let lacking = initial.filter(|region| !here(&region.chunk.hash));
             lacking.for_each(|region| add(region.chunk, Need::Version));
         }
         let (Some(version), Some(view)) = (&self.current, self.stage.view()) else { return };
@@ -310,9 +313,6 @@ impl GarmentLoader {
                 self.changed = true;
             }
             if next.generations.iter().any(|generation| generation.chunk.hash == chunk) {
-                let why = |e: kim2013::GenerationError| e.to_string();
-                let codec = |why| LoadError::Codec { garment, chunk, why };
-                kim2013::Generation::parse(bytes).map_err(|e| codec(why(e)))?;
                 self.parts.generations.insert(chunk, bytes.to_vec());
                 self.changed = true;
             }
@@ -338,13 +338,20 @@ impl GarmentLoader {
             chunk,
             source,
         })?;
-        let decoded: Result<Vec<Region>, String> = regions.regions.iter().map(decode).collect();
-        let decoded = decoded.map_err(|why| LoadError::Codec { garment, chunk, why })?;
-        let cache = match &mut self.next_cache {
-            Some(cache) if next.is_some() => cache,
-            _ => &mut self.cache,
+        let of_other_basis = next.is_some() && self.next_cache.is_some();
+        let decoded = match &self.parts.basis {
+            Some((_, decoder, _)) if !of_other_basis => decode_all(decoder, &regions),
+            _ => Ok(None),
         };
-        self.changed |= cache.insert(chunk, decoded, initial, &self.plan.keep);
+        let decoded = decoded.map_err(|why| LoadError::Codec { garment, chunk, why })?;
+        let Some(decoded) = decoded else {
+            if next.is_some() {
+                self.parts.regions.insert(chunk, (regions, initial));
+                self.changed = true;
+            }
+            return Ok(());
+        };
+        self.changed |= self.cache.insert(chunk, decoded, initial, &self.plan.keep);
         Ok(())
     }
 
@@ -355,7 +362,8 @@ impl GarmentLoader {
         let mut lacking = 0;
         self.parts.lacking(next, |_| lacking += 1);
         let initial = || next.regions.iter().filter(|region| region.initial);
-        lacking += initial().filter(|region| !cache.contains(&region.chunk.hash)).count();
+        let here = |chunk| cache.contains(chunk) || self.parts.regions.contains_key(chunk);
+        lacking += initial().filter(|region| !here(&region.chunk.hash)).count();
         if lacking > 0 {
             return Ok(false);
         }
@@ -368,8 +376,30 @@ impl GarmentLoader {
         if let Some(cache) = self.next_cache.take() {
             self.cache = cache;
         }
+        self.take_in_regions()?;
         self.cache.retain_initial(&keep);
         Ok(true)
+    }
+
+    /// Decodes the regions that waited for the basis.
+    fn take_in_regions(&mut self) -> Result<(), LoadError> {
+        let garment = self.id();
+        let Some((_, decoder, _)) = &self.parts.basis else { return Ok(()) };
+        for (chunk, (regions, initial)) in std::mem::take(&mut self.parts.regions) {
+            let codec = |why| LoadError::Codec { garment, chunk, why };
+            let lacking = || codec("it refers to a basis generation that is not listed".into());
+            let decoded = decode_all(decoder, &regions).map_err(codec);
+            match decoded.and_then(|decoded| decoded.ok_or_else(lacking)) {
+                Ok(decoded) => {
+                    self.cache.insert(chunk, decoded, initial, &self.plan.keep);
+                }
+                Err(error) => {
+                    self.refused.insert(chunk);
+                    return Err(error);
+                }
+            }
+        }
+        Ok(())
     }
 
     fn id(&self) -> GarmentId {
@@ -397,7 +427,7 @@ impl PartsSoFar {
 
     /// How many of the listed generations the basis at hand has; 0 if it has others.
     fn known_generations(&self, next: &GarmentVersion) -> usize {
-        let Some((hashes, _)) = &self.basis else { return 0 };
+        let Some((hashes, ..)) = &self.basis else { return 0 };
         let listed = next.generations.iter().map(|generation| generation.chunk.hash);
         let same = listed.zip(hashes).filter(|(a, b)| a == *b).count();
         if same == hashes.len() { same } else { 0 }
@@ -426,44 +456,51 @@ impl PartsSoFar {
     /// The basis with all listed generations; appends those that it lacks.
     fn basis(&mut self, next: &GarmentVersion) -> Result<Arc<Basis>, LoadError> {
         let known = self.known_generations(next);
-        let mut basis = match &self.basis {
-            Some((hashes, basis)) if known == next.generations.len() && known == hashes.len() => {
+        let mut decoder = match &self.basis {
+            Some((hashes, _, basis))
+                if known == next.generations.len() && known == hashes.len() =>
+            {
                 return Ok(Arc::clone(basis));
             }
-            Some((_, basis)) if known > 0 => Basis::clone(basis),
-            _ => Basis::new(),
+            Some((_, decoder, _)) if known > 0 => Decoder::clone(decoder),
+            _ => Decoder::new(&next.codec).ok_or_else(|| LoadError::Profile {
+                garment: next.name.clone(),
+                found: next.codec.clone(),
+            })?,
         };
         for generation in &next.generations[known..] {
             let chunk = generation.chunk.hash;
             let codec = |why| LoadError::Codec { garment: next.id, chunk, why };
             let bytes = self.generations.get(&chunk).map_or(&[][..], Vec::as_slice);
-            let parsed = kim2013::Generation::parse(bytes).map_err(|e| codec(e.to_string()))?;
-            basis.append(&parsed).map_err(|e| codec(e.to_string()))?;
+            decoder.append(bytes).map_err(|e| codec(e.to_string()))?;
         }
         let hashes = next.generations.iter().map(|generation| generation.chunk.hash).collect();
-        let basis = Arc::new(basis);
-        self.basis = Some((hashes, Arc::clone(&basis)));
+        let basis = Arc::new(decoder.basis().clone());
+        self.basis = Some((hashes, decoder, Arc::clone(&basis)));
         self.generations.clear();
         Ok(basis)
     }
 }
 
-/// Coefficients of a region as the publisher rounded them.
-fn decode(entry: &RegionEntry) -> Result<Region, String> {
-    let region = kim2013::Region::parse(&entry.bytes).map_err(|e| e.to_string())?;
-    if region.states() != usize::from(entry.state_count) {
-        let (found, listed) = (region.states(), entry.state_count);
+/// All regions of a chunk as the publisher rounded them; `None` where one needs a generation that
+/// is not here yet.
+fn decode_all(decoder: &Decoder, chunk: &RegionChunk) -> Result<Option<Vec<Region>>, String> {
+    let decoded: Result<Vec<Option<Region>>, String> =
+        chunk.regions.iter().map(|entry| decode(decoder, entry)).collect();
+    Ok(decoded?.into_iter().collect())
+}
+
+fn decode(decoder: &Decoder, entry: &RegionEntry) -> Result<Option<Region>, String> {
+    let region = decoder.region(&entry.bytes).map_err(|e| e.to_string())?;
+    if region.states != usize::from(entry.state_count) {
+        let (found, listed) = (region.states, entry.state_count);
         return Err(format!("a region of {found} states where {listed} are listed"));
     }
-    let columns = region.columns();
-    let mut fractions = vec![0.0; columns];
-    let mut coefficients = Vec::with_capacity(region.states() * columns);
-    for state in 0..region.states() {
-        region.state(state, &mut fractions);
-        let steps = fractions.iter().map(|c| (c * kim2013::FULL_SCALE).round() as i16);
-        coefficients.extend(steps);
+    if !region.is_whole {
+        return Ok(None);
     }
-    Ok(Region::new(entry.first_state, columns, coefficients))
+    let decoded = Region::new(entry.first_state, region.columns, region.coefficients);
+    Ok(Some(decoded.with_fixes(region.fixes)))
 }
 
 #[cfg(test)]

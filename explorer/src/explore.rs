@@ -17,7 +17,8 @@ use crate::grow::policy::Policy;
 use crate::grow::record::{PublishRecord, SteerRecord, TagRecord};
 use crate::grow::round::{self, Ended, RoundError};
 use crate::grow::work::{Work, WorkError};
-use crate::pack::{EncodeSettings, PublishError, Publisher, collect_leftovers};
+use crate::pack::publish::codec_of;
+use crate::pack::{Bound, EncodeSettings, Profile, PublishError, Publisher, collect_leftovers};
 use crate::scene::Scene;
 use crate::simulator::{SimulateError, Simulator, SimulatorFactory};
 use crate::tags::{Tagged, tagged_since};
@@ -50,6 +51,10 @@ pub struct ExploreOptions {
     /// Ends before less than this much is left on the disk of the work folder or of a local store,
     /// beside what a round may need (bytes).
     pub keep_free_bytes: u64,
+    /// How states are encoded: the profile that the store has, else `toile`, where this is `None`.
+    pub codec: Option<Profile>,
+    /// What profile `toile` keeps to, for states encoded from now on.
+    pub bound: Bound,
     /// As in the paper: neither early stop nor re-merging.
     pub paper: bool,
     /// Whether an exploration that ends by `frames` or `error_m` leaves the best prefix as head
@@ -69,6 +74,8 @@ impl Default for ExploreOptions {
             policy: Policy::Greedy,
             clips: Vec::new(),
             keep_free_bytes: 256 << 20,
+            codec: None,
+            bound: Bound::LIVE,
             paper: false,
             best_prefix_at_end: true,
             should_stop: Arc::new(|| false),
@@ -153,8 +160,12 @@ pub async fn explore(
     progress: &mut dyn FnMut(&Progress),
 ) -> Result<Summary, ExploreError> {
     let work = Work::open(&place.work, scene, options.paper)?;
-    let settings = EncodeSettings::for_rank(usize::from(scene.exploration.rank_max));
     let (store, key) = (Arc::clone(&place.store), place.key.clone());
+    let stored = codec_of(&*store, &scene.garment.name).await.map_err(PublishError::from)?;
+    let settings = match options.codec.or(stored).unwrap_or_default() {
+        Profile::Kim2013 => EncodeSettings::for_rank(usize::from(scene.exploration.rank_max)),
+        Profile::Toile => EncodeSettings::for_bound(options.bound),
+    };
     let publisher = Publisher::open(store, scene, key, settings).await?;
     // Only now: the folder is locked and the store is ours, so that nobody else is writing there.
     if let Some(folder) = &place.folder {

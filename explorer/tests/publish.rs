@@ -8,7 +8,7 @@ use std::sync::Arc;
 use codec::Basis;
 use codec::kim2013::{Generation, Region};
 use explorer::pack::{
-    EncodeSettings, InspectError, PublishError, Publisher, RunsError, StoreError,
+    Bound, EncodeSettings, InspectError, PublishError, Publisher, RunsError, StoreError,
     collect_leftovers, inspect, local_store,
 };
 use explorer::view::{GraphView, Run};
@@ -386,4 +386,33 @@ async fn a_full_disk_leaves_the_head_as_it_was() {
     let two = publisher.publish(&Ring::new(4)).await.unwrap();
     assert_eq!((two.number.0, two.created), (2, true));
     inspect(&*store, None).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_bounded_store_is_rebased_once_outgrown_keeps_its_bound_and_resumes() {
+    let bound = Bound { max_m: Some(0.004), rms_m: None };
+    let bounded = EncodeSettings::for_bound(bound);
+    let (mut stores, scene) = (Vec::new(), scene());
+    for interrupted in [false, true] {
+        let store = memory();
+        let open = || Publisher::open(store.clone(), &scene, key(), bounded);
+        let mut publisher = open().await.unwrap();
+        let mut rebased = Vec::new();
+        for jobs in [3, 6, 9, 12, 15] {
+            if interrupted {
+                publisher = open().await.unwrap();
+            }
+            let mut ring = Ring::new(jobs);
+            ring.odd_from = 4;
+            let published = publisher.publish(&ring).await.unwrap();
+            rebased.push(published.rebased);
+            let found = inspect(&*store, None).await.unwrap();
+            assert!(found.garments[0].codec_max_error_mm <= 4.0, "{jobs} jobs: {found:?}");
+        }
+        assert!(!rebased[0] && rebased.iter().any(|r| *r), "{rebased:?}");
+        let garment = publisher.head().unwrap().garment("sheet").unwrap();
+        assert_eq!((garment.codec.as_str(), garment.id.0), ("toile", 0));
+        stores.push(contents(&*store).await);
+    }
+    assert!(stores[0] == stores[1], "a resumed publisher writes what an uninterrupted one writes");
 }

@@ -126,10 +126,11 @@ fn another_basis_starts_over_with_a_cache_of_its_own() {
     let mut new = old;
     let mut bytes = Vec::new();
     let (mut x, mut y) = ([0i16; 3], [0i16; 3]);
-    codec::kim2013::quantise_column(&[1.0, 0.0, 0.0], kim2013::STEP_M, &mut x).unwrap();
-    codec::kim2013::quantise_column(&[0.0, 1.0, 0.0], kim2013::STEP_M, &mut y).unwrap();
+    codec::kim2013::quantise_column(&[1.0, 0.0, 0.0], codec::kim2013::STEP_M, &mut x).unwrap();
+    codec::kim2013::quantise_column(&[0.0, 1.0, 0.0], codec::kim2013::STEP_M, &mut y).unwrap();
     let entries = [x, y].concat();
-    kim2013::encode_generation(3, kim2013::STEP_M, &[1.0, 1.0], &entries, &mut bytes).unwrap();
+    codec::kim2013::encode_generation(3, codec::kim2013::STEP_M, &[1.0, 1.0], &entries, &mut bytes)
+        .unwrap();
     let chunk = ChunkRef { hash: ChunkHash::of(&bytes), bytes: bytes.len() as u32 };
     new.generations[0].chunk = chunk;
     chunks.insert(chunk.hash, bytes);

@@ -25,6 +25,11 @@ pub enum Profile {
 }
 
 impl Profile {
+    /// The profile of a name in a manifest.
+    pub fn named(name: &str) -> Option<Self> {
+        [Self::Kim2013, Self::Toile].into_iter().find(|profile| profile.name() == name)
+    }
+
     /// Its name in a manifest.
     pub fn name(self) -> &'static str {
         match self {

@@ -33,4 +33,6 @@ pub use regions::RunsError;
 pub use store::{StoreError, collect_leftovers, local_store, publisher};
 
 #[cfg(test)]
+mod bound_tests;
+#[cfg(test)]
 mod encode_tests;

@@ -433,6 +433,18 @@ impl Fixed {
     }
 }
 
+/// The profile in which a store holds a garment, if it does.
+///
+/// # Errors
+/// The store fails.
+pub async fn codec_of(from: &dyn ObjectStore, name: &str) -> Result<Option<Profile>, StoreError> {
+    let (number, publisher) = (store::head_number(from).await?, store::publisher(from).await?);
+    let (Some(number), Some(publisher)) = (number, publisher) else { return Ok(None) };
+    let head = store::version(from, number, &publisher).await?;
+    let garment = head.manifest.garment(name);
+    Ok(garment.and_then(|garment| Profile::named(&garment.codec)))
+}
+
 /// States covered by the region chunks: a prefix, since ids are given in order of creation.
 fn covered(garment: &GarmentVersion) -> u64 {
     garment.regions.last().map_or(0, |last| last.first_state.0 + u64::from(last.state_count))
