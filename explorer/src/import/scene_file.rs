@@ -29,7 +29,7 @@
 //! ```
 //!
 //! `[simulator]` with `command` and `timeout_s` names a program: [`crate::pipe`].
-//! `[exploration.metric]` and `[[exploration.class]]`: see [`super::metric`].
+//! `[exploration.metric]` and `[[exploration.class]]`: see `import::metric`.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
