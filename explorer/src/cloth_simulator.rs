@@ -122,7 +122,7 @@ impl ClothSimulator {
         let (from, to) = (from.moved(&home), to.moved(&home));
         let nudge = std::mem::take(&mut self.nudge);
         let body_speed_m_s = self.body_speed(&from, &to, seconds);
-        let (mut failed, mut kept) = (String::new(), None);
+        let (mut failed, mut kept, mut before) = (String::new(), None, None::<Fault>);
         let (mut substeps, mut iterations) = (0, 0);
         for (attempt, finer) in watchdog::REFINE.into_iter().enumerate() {
             let mut world = to_world(state, &from.hips());
@@ -151,9 +151,11 @@ impl ClothSimulator {
             frame.quality.frames_retried = u64::from(attempt > 0);
             frame.quality.frames_flagged = u64::from(fault.is_some());
             kept = Some(frame);
-            if fault.is_none() {
+            let resists = fault.zip(before).is_some_and(|(now, before)| now.resists(&before));
+            if fault.is_none() || resists {
                 break;
             }
+            before = fault;
         }
         let text = || format!("the cloth left its bounds, also at a quarter step: {failed}");
         let mut frame = kept.ok_or_else(|| SimulateError(text()))?;

@@ -42,6 +42,16 @@ pub enum Fault {
 }
 
 impl Fault {
+    /// Whether a finer step has not even halved the fault: a still finer one is not worth its
+    /// cost. So it is where skin, strain limit and contact contradict each other.
+    pub fn resists(&self, before: &Self) -> bool {
+        match (self, before) {
+            (Self::Deep(now), Self::Deep(before)) => now * 2.0 > *before,
+            (Self::Crossings(now), Self::Crossings(before)) => now * 2 > *before,
+            _ => false,
+        }
+    }
+
     /// The first fault of one frame.
     ///
     /// * `body_speed_m_s`: speed of the body's fastest point.
@@ -104,6 +114,10 @@ mod tests {
         assert_eq!(Fault::of(&fast, 6.0), None, "a fast body makes cloth fast");
         let deep = FrameQuality { deep_vertex_frames: 6, inside_vertex_frames: 9, ..calm() };
         assert_eq!(Fault::of(&deep, 0.0), Some(Fault::Deep(0.006)));
+        assert!(Fault::Deep(0.006).resists(&Fault::Deep(0.01)));
+        assert!(!Fault::Deep(0.006).resists(&Fault::Deep(0.02)));
+        assert!(!Fault::Deep(0.006).resists(&Fault::Speed(20.0)), "another fault");
+        assert!(Fault::Crossings(3).resists(&Fault::Crossings(4)));
         let spot = FrameQuality { deep_vertex_frames: 5, ..calm() };
         assert_eq!(Fault::of(&spot, 0.0), None);
     }
