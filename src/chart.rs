@@ -52,15 +52,18 @@ pub fn run(a: &args::Chart) -> Result<()> {
     let file = |name: &str| a.out.join(name);
     std::fs::write(file("codecs.csv"), csv(&measured)).context("writing codecs.csv")?;
     type Axis = fn(&Point) -> f64;
-    let bytes: Axis = |p| p.bytes;
-    let share: Axis = |p| p.total_bytes;
-    let time: Axis = |p| p.decode_ms;
+    // Codecs differ by factors of hundreds: equal factors take equal room.
+    let bytes: Axis = |p| p.bytes.log10();
+    let share: Axis = |p| p.total_bytes.log10();
+    let time: Axis = |p| p.decode_ms.log10();
     let charts = [
-        ("bytes-rms", "bytes per frame", bytes, "rms error (mm)", (|p| p.rms_mm) as Axis),
-        ("bytes-max", "bytes per frame", bytes, "largest error (mm)", |p| p.max_mm),
-        ("total-rms", "bytes per frame, basis included", share, "rms error (mm)", |p| p.rms_mm),
-        ("time-rms", "ms per frame", time, "rms error (mm)", |p| p.rms_mm),
-        ("time-max", "ms per frame", time, "largest error (mm)", |p| p.max_mm),
+        ("bytes-rms", "log10 of bytes per frame", bytes, "rms error (mm)", (|p| p.rms_mm) as Axis),
+        ("bytes-max", "log10 of bytes per frame", bytes, "largest error (mm)", |p| p.max_mm),
+        ("total-rms", "log10 of bytes per frame, basis included", share, "rms error (mm)", |p| {
+            p.rms_mm
+        }),
+        ("time-rms", "log10 of ms per frame", time, "rms error (mm)", |p| p.rms_mm),
+        ("time-max", "log10 of ms per frame", time, "largest error (mm)", |p| p.max_mm),
     ];
     for (name, x_label, x, y_label, y) in charts {
         let plot = plot(&measured, states, (x_label, x), (y_label, y));

@@ -6,10 +6,11 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use explorer::cloth::fabrics::{self, FABRICS};
 use explorer::cloth::lab::{self, BENCHES, Bench, Limit, Report, Row, Settings};
+use explorer::cpu::thread_cpu_s;
 use serde::Serialize;
 
 use crate::lab_record::Recorder;
-use crate::{args, clock, format, place};
+use crate::{args, format, place};
 
 /// Runs `toile lab ...`.
 pub fn run(a: args::Lab) -> Result<()> {
@@ -174,7 +175,7 @@ fn run_one(a: &args::LabRun) -> Result<()> {
         recorder.take(shot);
         true
     };
-    let report = bench.run(settings, &mut clock::thread_cpu_s, watch)?;
+    let report = bench.run(settings, &mut thread_cpu_s, watch)?;
     recorder.finish(bench.name)?;
     if a.json {
         return format::print_json(&Summary::new(&report));
@@ -232,11 +233,23 @@ fn number(x: f64) -> String {
     text
 }
 
-const HEAD: &str = "# Stability and accuracy of the simulator\n\n\
-Every bench of `toile lab list` with its figures, misses included. This page was written by\n\
-`toile lab table --out docs/results/stability.md`; a line is run again by `toile lab run NAME`.\n\
-CPU is milliseconds per 1/60 s of simulated time on one core, all runs of the bench together.\n\n\
-| test | measured | reference | figure | threshold | |\n| --- | --- | --- | --- | --- | --- |\n";
+/// The page's beginning, with the command that writes it again.
+fn head(only: &[String], quick: bool) -> String {
+    let names: String = only.iter().map(|name| format!("{name} ")).collect();
+    let quick = if quick { "--quick " } else { "" };
+    format!(
+        "# Stability and accuracy of the simulator\n\n\
+         Benches of `toile lab list` with their figures, misses included. This page was written by\n\
+         `toile lab table {names}{quick}--out docs/results/stability.md` (without `--quick`: all\n\
+         cases of each bench); a bench is run again by `toile lab run NAME`. CPU is\n\
+         milliseconds per 1/60 s of simulated time on one core, all runs of the bench together.\n\n\
+         | test | measured | reference | figure | threshold | |\n\
+         | --- | --- | --- | --- | --- | --- |\n"
+    )
+}
+
+/// Where the page's hand-written end begins; what stands there outlives a new table.
+const REASONS: &str = "\n## Why figures miss\n";
 
 /// Runs benches one after the other and writes the page.
 fn table(only: &[String], out: Option<&Path>, quick: bool) -> Result<()> {
@@ -248,12 +261,12 @@ fn table(only: &[String], out: Option<&Path>, quick: bool) -> Result<()> {
     if let Some(file) = out {
         place::ensure_writable(file)?;
     }
-    let mut page = HEAD.to_owned();
+    let mut page = head(only, quick);
     let (mut passed, mut all) = (0, 0);
     for bench in chosen {
         let settings = Settings { quick, ..Settings::default() };
         eprintln!("{}: {}", bench.name, bench.about);
-        let ran = bench.run(settings, &mut clock::thread_cpu_s, &mut |_| true);
+        let ran = bench.run(settings, &mut thread_cpu_s, &mut |_| true);
         let report = match ran {
             Ok(report) => report,
             Err(error) => {
@@ -282,6 +295,8 @@ fn table(only: &[String], out: Option<&Path>, quick: bool) -> Result<()> {
     writeln!(page, "\n{passed} of {all} figures pass.")?;
     match out {
         Some(file) => {
+            let old = std::fs::read_to_string(file).unwrap_or_default();
+            page.push_str(old.find(REASONS).map_or("", |at| &old[at..]));
             std::fs::write(file, page).with_context(|| format!("writing {}", file.display()))?
         }
         None => print!("{page}"),

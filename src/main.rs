@@ -2,7 +2,6 @@
 
 mod args;
 mod chart;
-mod clock;
 mod codec;
 mod compare;
 mod decode_bench;

@@ -5,7 +5,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use codec::{Basis, kim2013};
+use codec::{Basis, VertexFix, kim2013};
 use protocol::links::{LinkEntry, LinkPage};
 use protocol::manifest::{ChunkRef, GarmentVersion, GenerationRef, RegionChunkRef, VersionStats};
 use protocol::region::{RegionChunk, RegionEntry};
@@ -158,11 +158,17 @@ pub fn fractions(state: u64) -> [f32; 2] {
 
 /// A view in which the chunks named are resident.
 pub fn view(version: &Arc<Version>, parts: &[u64]) -> Arc<View> {
+    view_with(version, parts, &[])
+}
+
+/// The same; states of the first chunk have fixes.
+pub fn view_with(version: &Arc<Version>, parts: &[u64], fixes: &[VertexFix]) -> Arc<View> {
     let mut cache = Cache::new(1 << 20);
     for part in parts {
         let (first, count) = if *part == 0 { (0, 4) } else { (4, 8) };
         let rows = (first..first + count).flat_map(coefficients).collect();
-        let region = Region::new(StateId(first), 2, rows);
+        let own = if first == 0 { fixes.to_vec() } else { Vec::new() };
+        let region = Region::new(StateId(first), 2, rows).with_fixes(own);
         cache.insert(region_chunk(*part), vec![region], *part == 0, &BTreeSet::new());
     }
     Arc::new(View { version: Arc::clone(version), resident: Arc::new(cache.snapshot()) })

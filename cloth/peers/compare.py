@@ -104,7 +104,7 @@ def main():
     if a.out:
         head = ("# Beside other simulators\n\n"
                 "Printed by `cloth/peers/compare.sh --out docs/results/peers.md`: all simulators in turn, on one machine, in one run;\n"
-                "medians of " + str(a.repeats) + " runs, one thread's processor time. The scenes are `toile lab run S1` and `S2`.\n"
+                + ("one run each" if a.repeats == 1 else f"medians of {a.repeats} runs") + ", one thread's processor time. The scenes are `toile lab run S1` and `S2`.\n"
                 "Stretch is that of the frame in which the sheet is lowest; compare p99 (the pinned corner is a singularity).\n"
                 "MuJoCo has no self-collision here, Blender and Toile have.\n\n")
         a.out.write_text(head + table + "\n")

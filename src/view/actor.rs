@@ -47,8 +47,8 @@ pub struct Tint {
 pub struct Still {
     /// Which.
     pub state: StateId,
-    /// Its coefficients; empty until they are resident.
-    pub coefficients: Vec<f32>,
+    /// Its cloth (m, 3 a vertex, in the state frame); empty until it is resident.
+    pub positions: Vec<f32>,
 }
 
 /// A character on the page.
@@ -148,8 +148,8 @@ impl Actor {
         self.positions.resize(rows, 0.0);
         let used = self.columns.min(columns);
         match &self.still {
-            Some(Still { coefficients, .. }) if coefficients.len() >= used => {
-                version.basis().reconstruct(coefficients, 0..rows, used, &mut self.positions)?;
+            Some(still) if still.positions.len() == rows => {
+                self.positions.copy_from_slice(&still.positions);
             }
             _ => decode(&[&self.character], 0..rows, used, &mut self.positions)?,
         }

@@ -449,7 +449,7 @@ impl Show {
         for (pane, state) in [(1, dead_end), (2, target)] {
             let mut actor = Actor::new(character()?, pane);
             actor.character.place(StateId(state));
-            actor.still = Some(Still { state: StateId(state), coefficients: Vec::new() });
+            actor.still = Some(Still { state: StateId(state), positions: Vec::new() });
             actors.push(actor);
         }
         fill_stills(&mut actors);
@@ -523,41 +523,35 @@ impl Figures {
 /// Reads what stills show once it has been streamed, and colours the cloth by their distance.
 fn fill_stills(actors: &mut [Actor]) {
     let [walker, before, after] = actors else { return };
-    let waits = |actor: &Actor| actor.still.as_ref().is_some_and(|s| s.coefficients.is_empty());
+    let waits = |actor: &Actor| actor.still.as_ref().is_some_and(|s| s.positions.is_empty());
     if !waits(before) && !waits(after) {
         return;
     }
     for actor in [&mut *before, &mut *after] {
         actor.character.refresh();
         let Some(still) = &mut actor.still else { continue };
-        let mut coefficients = vec![0.0; actor.character.version().basis().columns()];
-        if actor.character.read(still.state, &mut coefficients) {
-            still.coefficients = coefficients;
+        if !matches!(actor.character.cloth_of(still.state, &mut still.positions), Ok(true)) {
+            still.positions.clear();
         }
     }
     if waits(before) || waits(after) {
         return;
     }
-    let tint = tint(before, after).unwrap_or_default();
+    let tint = tint(before, after);
     walker.tint = Tint { weight: 0.0, ..tint.clone() };
     before.tint = tint.clone();
     after.tint = tint;
 }
 
 /// Distances between the cloth of two stills, by vertex, as shares of the largest.
-fn tint(a: &Actor, b: &Actor) -> Result<Tint> {
-    let (Some(a_still), Some(b_still)) = (&a.still, &b.still) else { return Ok(Tint::default()) };
-    let basis = a.character.version().basis();
-    let pairs = a_still.coefficients.iter().zip(&b_still.coefficients);
-    let difference: Vec<f32> = pairs.map(|(a, b)| a - b).collect();
-    let mut apart = vec![0.0; basis.rows()];
-    basis.reconstruct(&difference, 0..apart.len(), basis.columns(), &mut apart)?;
-    let (vertices, _) = apart.as_chunks::<3>();
-    let distances = vertices.iter().map(|v| Vec3::from_array(*v).length());
-    let distances: Vec<f32> = distances.collect();
+fn tint(a: &Actor, b: &Actor) -> Tint {
+    let (Some(a), Some(b)) = (&a.still, &b.still) else { return Tint::default() };
+    let ((a, _), (b, _)) = (a.positions.as_chunks::<3>(), b.positions.as_chunks::<3>());
+    let apart = a.iter().zip(b).map(|(a, b)| Vec3::from_array(*a).distance(Vec3::from_array(*b)));
+    let distances: Vec<f32> = apart.collect();
     let largest = distances.iter().copied().fold(0.0f32, f32::max);
     if largest < 1e-5 {
-        return Ok(Tint::default());
+        return Tint::default();
     }
-    Ok(Tint { shares: distances.iter().map(|d| d / largest).collect(), weight: 1.0 })
+    Tint { shares: distances.iter().map(|d| d / largest).collect(), weight: 1.0 }
 }

@@ -1,5 +1,6 @@
 //! For tools that look: placing a character at a state, reading states, what was just passed.
 
+use codec::ReconstructError;
 use protocol::StateId;
 
 use super::{Character, Shown};
@@ -37,6 +38,29 @@ impl Character {
     /// Coefficients of a state (fractions of full scale) into `out`, where they are resident.
     pub fn read(&self, state: StateId, out: &mut [f32]) -> bool {
         self.view.resident.read(state, out)
+    }
+
+    /// Positions of a state (m, 3 a vertex, in the state frame) with every column and the state's own
+    /// fixes, into `out`; `false` where it is not resident.
+    ///
+    /// # Errors
+    /// A basis that cannot be applied; no version that was taken up has one.
+    pub fn cloth_of(&self, state: StateId, out: &mut Vec<f32>) -> Result<bool, ReconstructError> {
+        let basis = self.view.version.basis();
+        let mut coefficients = vec![0.0; basis.columns()];
+        if !self.view.resident.read(state, &mut coefficients) {
+            return Ok(false);
+        }
+        out.resize(basis.rows(), 0.0);
+        basis.reconstruct(&coefficients, 0..basis.rows(), basis.columns(), out)?;
+        let mut fixes = Vec::new();
+        self.view.resident.fixes(state, &mut fixes);
+        for (vertex, offset) in fixes {
+            let at = 3 * vertex as usize;
+            let rows = out.get_mut(at..at + 3).into_iter().flatten();
+            rows.zip(offset).for_each(|(row, part)| *row += part);
+        }
+        Ok(true)
     }
 
     /// Takes up a newer version without a step, so that [`Character::version`] is what the next

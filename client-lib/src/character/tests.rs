@@ -1,5 +1,6 @@
 use super::*;
 use crate::tiny;
+use codec::VertexFix;
 
 fn at(pose: u32) -> PoseId {
     PoseId(pose)
@@ -254,6 +255,29 @@ fn a_character_can_be_placed_before_a_merge_and_says_what_it_passes() {
     let mut coefficients = [9.0; 2];
     assert!(character.read(StateId(3), &mut coefficients));
     assert_near(coefficients, tiny::fractions(3));
+}
+
+#[test]
+fn a_state_of_its_own_is_shown_with_the_fixes_that_keep_its_bound() {
+    let version = tiny::version(1, tiny::initial_links());
+    let fix = VertexFix { state: 1, vertex: 0, offset_m: [0.5, 0.0, -0.25] };
+    let (_stage, mut character) = enter(&tiny::view_with(&version, &[0], &[fix]));
+    let (_plain_stage, plain) = enter(&tiny::view(&version, &[0]));
+    let cloth = |character: &Character, state| {
+        let mut out = Vec::new();
+        assert!(character.cloth_of(StateId(state), &mut out).unwrap());
+        out
+    };
+    assert_eq!(cloth(&character, 0), cloth(&plain, 0));
+    let expected: Vec<f32> =
+        cloth(&plain, 1).iter().zip(fix.offset_m).map(|(p, o)| p + o).collect();
+    assert_eq!(cloth(&character, 1), expected);
+    // What is played is the same cloth.
+    character.step(at(1));
+    let mut played = vec![0.0; 3];
+    decode(&[&character], 0..3, usize::MAX, &mut played).unwrap();
+    assert_eq!(played, expected);
+    assert!(!character.cloth_of(StateId(5), &mut Vec::new()).unwrap(), "not resident");
 }
 
 #[test]
