@@ -134,6 +134,7 @@ pub fn version(number: u64, links: Vec<LinkEntry>) -> Arc<Version> {
         regions,
         links: vec![chunk(ChunkHash::of(b"links"))],
         stats: VersionStats::default(),
+        upsampler: None,
     };
     let parts = Parts {
         number: VersionNumber(number),
@@ -214,6 +215,7 @@ pub fn published(links: Vec<LinkEntry>) -> (GarmentVersion, BTreeMap<ChunkHash, 
         regions,
         links: vec![put(LinkPage { first_state: StateId(0), entries: links }.encode())],
         stats: VersionStats::default(),
+        upsampler: None,
     };
     (garment, chunks)
 }

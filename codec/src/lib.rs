@@ -32,7 +32,8 @@
 //! ```
 //!
 //! Map: [`kim2013`] the first profile's bitstream; [`toile`] the bounded one, over [`entropy`];
-//! [`basis`] the resident columns; [`kernel`] the SIMD room. The byte tables stand in docs/formats.md.
+//! [`basis`] the resident columns; [`upsample`] a learned upsampler; [`kernel`] the SIMD room. The
+//! byte tables stand in docs/formats.md.
 
 pub mod basis;
 pub mod decoder;
@@ -40,6 +41,7 @@ pub mod entropy;
 pub mod kernel;
 pub mod kim2013;
 pub mod toile;
+pub mod upsample;
 
 pub use basis::{AppendError, Basis, ReconstructError};
 pub use decoder::{DecodedRegion, Decoder, DecoderError, VertexFix};

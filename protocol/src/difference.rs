@@ -9,7 +9,7 @@ use crate::ids::{ChunkHash, GarmentId, VersionNumber};
 use crate::limits;
 use crate::manifest::{
     ChunkRef, GarmentVersion, GenerationRef, Manifest, ManifestError, RegionChunkRef,
-    SignedManifest, VersionStats,
+    SignedManifest, Upsamplers, VersionStats,
 };
 use crate::sign::{PublisherKey, Signature};
 use crate::wire::{DecodeError, Format};
@@ -20,6 +20,9 @@ const DIFFERENCE: Format = Format {
     version: 1,
     bytes_max: limits::MANIFEST_BYTES_MAX,
 };
+
+/// Version 2 is version 1 and the upsamplers of the manifest it leads to, as in a manifest.
+const WITH_UPSAMPLERS: Format = Format { version: 2, ..DIFFERENCE };
 
 /// Turns a manifest that the receiver holds into a newer (or any other) one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -33,6 +36,9 @@ pub struct ManifestDifference {
     previous: Option<ChunkHash>,
     garments: Vec<GarmentDifference>,
     signature: Signature,
+    /// All of the manifest it leads to; it stands apart in the bytes.
+    #[serde(skip)]
+    upsamplers: Upsamplers,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -104,6 +110,7 @@ impl ManifestDifference {
             previous: to.manifest.previous,
             garments: to.manifest.garments.iter().map(changed).collect(),
             signature: to.signature,
+            upsamplers: to.manifest.upsamplers(),
         }
     }
 
@@ -131,8 +138,13 @@ impl ManifestDifference {
                 changed.apply(base.garments.iter().find(|g| g.id == changed.id), &mut room)
             }
         });
-        let garments = garments.collect::<Option<_>>().ok_or(misfit)?;
-        let manifest = Manifest { number: self.number, previous: self.previous, garments };
+        let garments: Vec<GarmentVersion> = garments.collect::<Option<_>>().ok_or(misfit)?;
+        let mut manifest = Manifest { number: self.number, previous: self.previous, garments };
+        manifest.garments.iter_mut().for_each(|garment| garment.upsampler = None);
+        if !self.upsamplers.is_empty() {
+            let misfit = |_| ApplyError::DoesNotFit(self.number);
+            manifest.set_upsamplers(&self.upsamplers).map_err(misfit)?;
+        }
         manifest.check().map_err(ManifestError::from)?;
         let signed = SignedManifest { manifest, signature: self.signature };
         signed.verify(publisher)?;
@@ -141,7 +153,10 @@ impl ManifestDifference {
 
     /// Bytes to send.
     pub fn encode(&self) -> Vec<u8> {
-        DIFFERENCE.encode(self)
+        if self.upsamplers.is_empty() {
+            return DIFFERENCE.encode(self);
+        }
+        WITH_UPSAMPLERS.encode(&(self, &self.upsamplers))
     }
 
     /// Reads; what it means is checked by [`ManifestDifference::apply`].
@@ -149,7 +164,19 @@ impl ManifestDifference {
     /// # Errors
     /// Damaged bytes.
     pub fn decode(bytes: &[u8]) -> Result<Self, DecodeError> {
-        let difference: Self = DIFFERENCE.decode(bytes)?;
+        let difference = if Format::is_after(bytes, DIFFERENCE.version) {
+            let (plain, upsamplers): (Self, Upsamplers) = WITH_UPSAMPLERS.decode(bytes)?;
+            let small =
+                |(_, chunk): &(_, ChunkRef)| chunk.bytes as usize <= limits::CHUNK_BYTES_MAX;
+            let fits = (1..=limits::GARMENTS_MAX).contains(&upsamplers.len());
+            if !fits || !upsamplers.iter().all(small) {
+                let why = format!("{} upsamplers, or one too large", upsamplers.len());
+                return Err(DIFFERENCE.invalid(why));
+            }
+            Self { upsamplers, ..plain }
+        } else {
+            DIFFERENCE.decode(bytes)?
+        };
         if difference.garments.len() > limits::GARMENTS_MAX {
             let why = format!("{} garments are too many", difference.garments.len());
             return Err(DIFFERENCE.invalid(why));
@@ -186,6 +213,7 @@ impl Changed {
             regions: join(base.map_or(&[], |b| &b.regions), &self.regions, room)?,
             links: join(base.map_or(&[], |b| &b.links), &self.links, room)?,
             stats: self.stats,
+            upsampler: None,
         })
     }
 }

@@ -35,6 +35,12 @@ pub const LINK_PAGE_STATES: usize = 256;
 pub const MANIFEST_ENTRIES_MAX: usize = 1 << 19;
 /// Basis generations of a garment.
 pub const GENERATIONS_MAX: usize = 64;
+/// Points of an upsampler's coarse cloth; fine vertices are a garment's (`VERTICES_MAX`).
+pub const COARSE_POINTS_MAX: usize = 1024;
+/// Weights of an upsampler, all rows together.
+pub const UPSAMPLER_WEIGHTS_MAX: usize = 1 << 24;
+/// Capsules, oscillatory modes and class rules of an upsampler.
+pub const UPSAMPLER_PARTS_MAX: [usize; 3] = [64, 16, 7];
 /// Bytes of a token.
 pub const TOKEN_BYTES_MAX: usize = 1024;
 /// Bytes of the sentence in a close message.

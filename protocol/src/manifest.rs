@@ -14,6 +14,13 @@ const MANIFEST: Format = Format {
     bytes_max: limits::MANIFEST_BYTES_MAX - SIGNATURE_BYTES,
 };
 
+/// Version 2 is version 1 and the list of upsamplers after it. A manifest without any is written as
+/// version 1, so that equal content has one form.
+const WITH_UPSAMPLERS: Format = Format { version: 2, ..MANIFEST };
+
+/// What follows a manifest of version 2: garments that have an upsampler, by id.
+pub(crate) type Upsamplers = Vec<(GarmentId, ChunkRef)>;
+
 /// A chunk by name and size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct ChunkRef {
@@ -81,6 +88,10 @@ pub struct GarmentVersion {
     pub links: Vec<ChunkRef>,
     /// What is known of this version.
     pub stats: VersionStats,
+    /// A learned upsampler (`codec::upsample`), with which clients leave the graph. It stands apart in
+    /// the bytes, see `docs/formats.md`.
+    #[serde(skip)]
+    pub upsampler: Option<ChunkRef>,
 }
 
 /// A basis generation.
@@ -139,7 +150,11 @@ impl Manifest {
     /// If [`Manifest::check`] fails.
     pub fn encode(&self) -> Vec<u8> {
         self.check().expect("a manifest is checked before it is written");
-        MANIFEST.encode(self)
+        let upsamplers = self.upsamplers();
+        if upsamplers.is_empty() {
+            return MANIFEST.encode(self);
+        }
+        WITH_UPSAMPLERS.encode(&(self, upsamplers))
     }
 
     /// Reads unsigned bytes and checks them.
@@ -147,9 +162,33 @@ impl Manifest {
     /// # Errors
     /// Damaged bytes, or a manifest that breaks a rule of [`Manifest::check`].
     pub fn decode(bytes: &[u8]) -> Result<Self, DecodeError> {
-        let manifest: Self = MANIFEST.decode(bytes)?;
+        let manifest = if Format::is_after(bytes, MANIFEST.version) {
+            let (mut manifest, upsamplers): (Self, Upsamplers) = WITH_UPSAMPLERS.decode(bytes)?;
+            manifest.set_upsamplers(&upsamplers).map_err(|why| MANIFEST.invalid(why))?;
+            manifest
+        } else {
+            MANIFEST.decode(bytes)?
+        };
         manifest.check()?;
         Ok(manifest)
+    }
+
+    /// Garments that have an upsampler, by id.
+    pub(crate) fn upsamplers(&self) -> Upsamplers {
+        let of = |garment: &GarmentVersion| Some((garment.id, garment.upsampler?));
+        self.garments.iter().filter_map(of).collect()
+    }
+
+    /// Gives garments their upsamplers; refuses a list that no manifest would be written with.
+    pub(crate) fn set_upsamplers(&mut self, list: &[(GarmentId, ChunkRef)]) -> Result<(), String> {
+        ensure(!list.is_empty(), || "an empty list of upsamplers".into())?;
+        ensure(list.is_sorted_by(|a, b| a.0 < b.0), || "upsamplers are out of order".into())?;
+        for (id, chunk) in list {
+            let garment = self.garments.iter_mut().find(|garment| garment.id == *id);
+            let garment = garment.ok_or_else(|| format!("an upsampler of no garment, {id}"))?;
+            garment.upsampler = Some(*chunk);
+        }
+        Ok(())
     }
 
     /// BLAKE3 of the unsigned bytes: what `previous` and differences name.
@@ -244,6 +283,7 @@ impl GarmentVersion {
             .chain(self.generations.iter().map(|generation| generation.chunk))
             .chain(self.links.iter().copied())
             .chain(self.regions.iter().map(|region| region.chunk))
+            .chain(self.upsampler)
     }
 
     fn check(&self) -> Result<(), String> {

@@ -115,6 +115,11 @@ impl Format {
         parse(what, &bytes[HEADER_BYTES..])
     }
 
+    /// Whether bytes state a version above `version`; [`Format::decode`] checks which.
+    pub(crate) fn is_after(bytes: &[u8], version: u16) -> bool {
+        bytes.get(4..6).is_some_and(|v| u16::from_le_bytes([v[0], v[1]]) > version)
+    }
+
     pub(crate) fn invalid(&self, why: String) -> DecodeError {
         DecodeError::Invalid { what: self.what, why }
     }

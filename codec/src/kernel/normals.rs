@@ -45,6 +45,11 @@ impl Faces {
         Ok(Self { vertices, triangles })
     }
 
+    /// How many vertices there are.
+    pub fn vertices(&self) -> usize {
+        self.vertices
+    }
+
     /// Unit normals of all vertices from their positions (m), both x0, y0, z0, x1, ...; (0, 0, 0)
     /// where the triangles around a vertex have no area. No allocation.
     ///

@@ -48,6 +48,9 @@ pub enum PublishError {
     /// States cannot be encoded.
     #[error("encoding: {0}")]
     Encode(#[from] EncodeError),
+    /// No upsampler.
+    #[error(transparent)]
+    Upsampler(#[from] codec::upsample::UpsampleError),
     /// The store belongs to another key.
     #[error(
         "the store belongs to publisher {found}, but this key is {ours}; give the work folder \
@@ -93,6 +96,8 @@ pub struct Publisher {
     encoder: Encoder,
     /// Largest error of the garment's first version (m).
     first_error_m: Option<f32>,
+    /// An upsampler to publish with the next version.
+    upsampler: Option<Vec<u8>>,
 }
 
 /// What never changes.
@@ -153,8 +158,16 @@ impl Publisher {
         let scene = Fixed::new(scene)?;
         claim(&*store, &key).await?;
         let encoder = Encoder::new(&settings);
-        let mut publisher =
-            Self { store, key, settings, scene, head: None, encoder, first_error_m: None };
+        let mut publisher = Self {
+            store,
+            key,
+            settings,
+            scene,
+            head: None,
+            encoder,
+            first_error_m: None,
+            upsampler: None,
+        };
         if let Some(number) = store::head_number(&*publisher.store).await? {
             publisher.recover(number).await?;
         }
@@ -164,6 +177,21 @@ impl Publisher {
     /// The newest version, if there is one.
     pub fn head(&self) -> Option<&Manifest> {
         self.head.as_ref()
+    }
+
+    /// From the next version on the garment has this upsampler (the bytes of
+    /// `codec::upsample::Parts::encode`); later versions keep it.
+    ///
+    /// # Errors
+    /// Bytes that are none, or one of another garment.
+    pub fn set_upsampler(&mut self, bytes: Vec<u8>) -> Result<(), PublishError> {
+        let upsampler = codec::upsample::Upsampler::decode(&bytes)?;
+        let (found, expected) = (upsampler.fine(), self.scene.vertex_count);
+        if found != expected {
+            return Err(PublishError::Vertices { view: found, garment: expected });
+        }
+        self.upsampler = Some(bytes);
+        Ok(())
     }
 
     /// Prepares and commits. The future is not `Send` where the view is not `Sync`; then call
@@ -328,6 +356,15 @@ impl Publisher {
             regions: covered,
             links: pages.iter().map(|page| chunks.add(page.encode())).collect(),
             stats,
+            upsampler: self.upsampler(chunks),
+        }
+    }
+
+    /// The upsampler given to this publisher, else the one that the store has.
+    fn upsampler(&self, chunks: &mut NewChunks) -> Option<ChunkRef> {
+        match &self.upsampler {
+            Some(bytes) => Some(chunks.add(bytes.clone())),
+            None => self.garment().and_then(|garment| garment.upsampler),
         }
     }
 

@@ -120,8 +120,16 @@ pub fn manifest(number: u64, regions: u64, pages: u64, salt: u64) -> Manifest {
                 worst_error_m: 0.005,
                 ..VersionStats::default()
             },
+            upsampler: None,
         }],
     }
+}
+
+/// The same with an upsampler.
+pub fn upsampled(number: u64, name: u64) -> Manifest {
+    let mut manifest = manifest(number, 2, 3, 0);
+    manifest.garments[0].upsampler = Some(chunk(name));
+    manifest
 }
 
 pub fn key() -> SigningKey {

@@ -79,6 +79,7 @@ impl World {
                     worst_error_m: 0.01 / number as f32,
                     ..VersionStats::default()
                 },
+                upsampler: None,
             }],
         }
     }
