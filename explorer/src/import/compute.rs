@@ -5,13 +5,14 @@
 //! hoped for: every clip gets its two best exits out of its last frames and its two best entries
 //! into its first ones, and whatever is still apart is joined at the best place.
 
-use std::cmp::Ordering;
 use std::collections::BTreeSet;
 
 use cloth::Skeleton;
 
 use super::align::{JointTrack, WINDOW};
 use super::character::Clip;
+use super::distances::{Columns, MARGIN_FRAMES, Table, nearer, place};
+use super::exits::Way;
 use super::motion_graph::{FileClip, FileTransition, GraphFile, Topology};
 use super::reach::Reach;
 use super::transition::{self, Transition};
@@ -22,21 +23,24 @@ const END_SHARE: f32 = 0.04;
 const END_FRAMES_MIN: usize = 6;
 /// Guaranteed exits and entries of a clip.
 const WAYS: usize = 2;
-/// A transition leaves at this frame or later, and arrives with as many left.
-const MARGIN_FRAMES: usize = 15;
-/// Frames of one clip that are nearer than this are not joined.
-const SAME_CLIP_FRAMES: usize = 20;
 /// Shortest clip that can be left and entered under these rules.
 const CLIP_FRAMES_MIN: usize = 2 * MARGIN_FRAMES;
 /// Beyond this distance no transition is taken for the sake of a shorter way (m).
 const DISTANCE_M_MAX: f32 = 0.35;
+/// Whoever gets into a clip for the sake of a shorter way can stay for so long: the transition, a second.
+const STAY_FRAMES: usize = 40;
+/// Between two exits to a clip that need not be reached soon, as multiples of the gap between others.
+const ACTION_GAPS: usize = 8;
+/// Exits further apart than this are not evenly spaced, but few.
+const GAP_FRAMES_MAX: usize = 300;
 
 /// How many transitions are asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Density {
     /// Every local minimum of the distance below this (m).
     Threshold(f32),
-    /// As few, best first, as bring the median time to reach a given clip to this (s).
+    /// As few as bring the median time to reach a given clip to this (s): either the best fits first,
+    /// or exits at even intervals ([`mod@super::exits`]), whichever needs fewer.
     Reach(f32),
 }
 
@@ -64,7 +68,8 @@ pub enum ComputeError {
     /// The density asked for cannot be had.
     #[error(
         "a median of {asked_s} s to reach a clip cannot be had: with all {transitions} transitions \
-         under {DISTANCE_M_MAX} m it is {best_s:.2} s; ask for that or more, or add clips"
+         under {DISTANCE_M_MAX} m it is {best_s:.2} s; ask for that or more, name the clips that count \
+         (--to, or reach_clips), or add clips"
     )]
     Unreachable {
         /// As asked for.
@@ -106,30 +111,21 @@ pub fn compute(
     let mut chosen = found.ways();
     join(&tracks, &frames, &mut chosen);
     found.minima.sort_by(nearer);
-    let mut taken: BTreeSet<_> = chosen.iter().map(place).collect();
+    let taken: BTreeSet<_> = chosen.iter().map(place).collect();
     found.minima.retain(|t| !taken.contains(&place(t)));
-    if let Density::Reach(asked_s) = density {
-        let near = found.minima.partition_point(|t| t.distance_m < DISTANCE_M_MAX);
-        let all: Vec<_> = chosen.iter().chain(&found.minima[..near]).copied().collect();
-        if Reach::to_clips(&frames, &all, fps, &to).median_s > asked_s {
-            // Then also where each frame fits best, whether or not its neighbours fit better.
-            taken.extend(found.minima.iter().map(place));
-            found.minima.truncate(near);
-            let rows = found.rows.iter().filter(|t| to.contains(&t.to_clip));
-            let mut rows: Vec<_> = rows.filter(|t| !taken.contains(&place(t))).copied().collect();
-            rows.sort_by(nearer);
-            found.minima.extend(rows);
-        }
-    }
     let more = match density {
-        Density::Threshold(limit_m) => found.minima.partition_point(|t| t.distance_m < limit_m),
+        Density::Threshold(limit_m) => {
+            let more = found.minima.partition_point(|t| t.distance_m < limit_m);
+            found.minima[..more].to_vec()
+        }
         Density::Reach(asked_s) => {
-            let candidates = (&found.minima[..], &chosen[..]);
-            enough(candidates, (&frames, fps), &to, asked_s)?
+            let goal = Goal { frames: &frames, fps, to: &to, asked_s };
+            found.enough(&chosen, &goal)?
         }
     };
-    chosen.extend_from_slice(&found.minima[..more]);
+    chosen.extend(more);
     chosen.sort_by_key(place);
+    chosen.dedup_by_key(|t| place(t));
     Ok(chosen)
 }
 
@@ -170,45 +166,39 @@ fn named(clips: &[Clip], names: &[String]) -> Result<Vec<usize>, ComputeError> {
     names.iter().map(place).collect()
 }
 
-fn place(t: &Transition) -> (usize, usize, usize, usize) {
-    (t.from_clip, t.from_frame, t.to_clip, t.to_frame)
-}
-
-fn nearer(a: &Transition, b: &Transition) -> Ordering {
-    a.distance_m.total_cmp(&b.distance_m).then(place(a).cmp(&place(b)))
-}
-
-/// The smallest number of further transitions that reaches the density asked for.
-fn enough(
-    (minima, chosen): (&[Transition], &[Transition]),
-    (frames, fps): (&[usize], f32),
-    to: &[usize],
+/// What a density asks for.
+struct Goal<'a> {
+    frames: &'a [usize],
+    fps: f32,
+    to: &'a [usize],
     asked_s: f32,
-) -> Result<usize, ComputeError> {
-    let most = minima.iter().filter(|t| t.distance_m < DISTANCE_M_MAX).count();
-    let median_s = |more: usize| {
-        let all: Vec<_> = chosen.iter().chain(&minima[..more]).copied().collect();
-        Reach::to_clips(frames, &all, fps, to).median_s
-    };
-    let best_s = median_s(most);
-    if best_s > asked_s {
-        let transitions = chosen.len() + most;
-        return Err(ComputeError::Unreachable { asked_s, best_s, transitions });
+}
+
+impl Goal<'_> {
+    fn median_s(&self, chosen: &[Transition], more: &[Transition]) -> f32 {
+        let all: Vec<_> = chosen.iter().chain(more).copied().collect();
+        Reach::to_clips(self.frames, &all, self.fps, self.to).median_s
     }
-    let (mut low, mut high) = (0, most);
-    while low < high {
-        let middle = (low + high) / 2;
-        if median_s(middle) <= asked_s { high = middle } else { low = middle + 1 }
+
+    /// The smallest of `0..=most` that `is_met`, where it is met by `most` and by all above the smallest.
+    fn least(most: usize, is_met: impl Fn(usize) -> bool) -> usize {
+        let (mut low, mut high) = (0, most);
+        while low < high {
+            let middle = (low + high) / 2;
+            if is_met(middle) { high = middle } else { low = middle + 1 }
+        }
+        high
     }
-    Ok(high)
 }
 
 /// What the search over all pairs of frames found.
 struct Found {
     clips: usize,
     minima: Vec<Transition>,
-    /// Where each frame goes on best in each other clip.
-    rows: Vec<Transition>,
+    /// Where each frame goes on best, by (from, to),
+    ways: Vec<Way>,
+    /// and where in the first third.
+    begins: Vec<Way>,
     /// The best exit out of the end of a clip into each clip; `clips * clips`, by (from, to).
     exits: Vec<Option<Transition>>,
     /// The best entry into the beginning of a clip from each clip; by (from, to).
@@ -219,21 +209,76 @@ impl Found {
     fn search(tracks: &[JointTrack]) -> Self {
         let clips = tracks.len();
         let columns: Vec<Columns> = tracks.iter().map(Columns::new).collect();
-        let (mut minima, mut rows) = (Vec::new(), Vec::new());
+        let (mut minima, mut ways, mut begins) = (Vec::new(), Vec::new(), Vec::new());
         let (mut exits, mut entries) = (Vec::new(), Vec::new());
         for from in 0..clips {
             for to in 0..clips {
                 let table = Table::new(from, to, &columns[from], &columns[to]);
                 minima.extend(table.minima());
-                if from != to {
-                    rows.extend(table.row_minima());
-                }
-                let (last, first) = (end_frames(table.rows), end_frames(table.columns));
-                exits.push(table.best(|row, _| row + last >= table.rows));
+                let [rows, columns] = [from, to].map(|clip| tracks[clip].frame_count());
+                let way = |mut fits: Vec<Transition>| {
+                    fits.retain(|t| t.distance_m < DISTANCE_M_MAX);
+                    Way { fits, first: MARGIN_FRAMES, frames: rows }
+                };
+                let stay = STAY_FRAMES.min(columns / 2);
+                ways.push(way(table.row_minima(|column| column + stay < columns)));
+                begins.push(way(table.row_minima(|column| 3 * column < columns)));
+                let [last, first] = [rows, columns].map(end_frames);
+                exits.push(table.best(|row, _| row + last >= rows));
                 entries.push(table.best(|_, column| column < first));
             }
         }
-        Self { clips, minima, rows, exits, entries }
+        Self { clips, minima, ways, begins, exits, entries }
+    }
+
+    /// The fewest further transitions that reach the density asked for.
+    fn enough(
+        &self,
+        chosen: &[Transition],
+        goal: &Goal<'_>,
+    ) -> Result<Vec<Transition>, ComputeError> {
+        let near = self.minima.partition_point(|t| t.distance_m < DISTANCE_M_MAX);
+        let is_met = |more: &[Transition]| goal.median_s(chosen, more) <= goal.asked_s;
+        let best_first = is_met(&self.minima[..near]).then(|| {
+            let count = Goal::least(near, |count| is_met(&self.minima[..count]));
+            self.minima[..count].to_vec()
+        });
+        let evenly = is_met(&self.evenly(goal.to, 1)).then(|| {
+            let gap = |skipped: usize| GAP_FRAMES_MAX - skipped;
+            let skipped = |skipped: usize| is_met(&self.evenly(goal.to, gap(skipped)));
+            self.evenly(goal.to, gap(Goal::least(GAP_FRAMES_MAX - 1, skipped)))
+        });
+        let fewest = [best_first, evenly].into_iter().flatten().min_by_key(Vec::len);
+        fewest.ok_or_else(|| {
+            let all = self.evenly(goal.to, 1);
+            let best_s = goal.median_s(chosen, &all);
+            let transitions = chosen.len() + all.len();
+            ComputeError::Unreachable { asked_s: goal.asked_s, best_s, transitions }
+        })
+    }
+
+    /// Exits from each of these clips (or all, where there is one) to each other one, `gap` frames apart, and to the beginning of every
+    /// further clip, eight times as far apart; and one way for each from its last third back into its first,
+    /// so that it can be played on.
+    fn evenly(&self, to: &[usize], gap: usize) -> Vec<Transition> {
+        let mut all = Vec::new();
+        for pair in 0..self.clips * self.clips {
+            let (from, into) = (pair / self.clips, pair % self.clips);
+            // One clip alone is to be reached from everywhere.
+            if to.len() > 1 && !to.contains(&from) || to.len() == 1 && !to.contains(&into) {
+                continue;
+            }
+            if !to.contains(&into) {
+                all.extend(self.begins[pair].exits(ACTION_GAPS * gap));
+            } else if from != into {
+                all.extend(self.ways[pair].exits(gap));
+            } else {
+                let way = &self.begins[pair];
+                let back = |t: &&Transition| 3 * t.from_frame >= 2 * way.frames;
+                all.extend(way.fits.iter().filter(back).copied().min_by(nearer));
+            }
+        }
+        all
     }
 
     /// The guaranteed exits and entries: the best ones, to and from different clips. Another clip
@@ -293,202 +338,10 @@ fn end_frames(frames: usize) -> usize {
     END_FRAMES_MIN.max((frames as f32 * END_SHARE).ceil() as usize)
 }
 
-/// Joint coordinates of a clip, one run of frames per joint, and the sums that a fit needs.
-struct Columns {
-    frames: usize,
-    joints: usize,
-    /// Frames that are stored: extrapolated ones included.
-    stored: usize,
-    coordinates: [Vec<f64>; 3],
-    /// Sums over the joints of a window: x, z and squares.
-    sums: Vec<[f64; 3]>,
-}
-
-impl Columns {
-    fn new(track: &JointTrack) -> Self {
-        let (joints, stored) = (track.joint_count(), track.stored_count());
-        let mut columns = Self {
-            frames: track.frame_count(),
-            joints,
-            stored,
-            coordinates: [(); 3].map(|()| vec![0.0; joints * stored]),
-            sums: Vec::new(),
-        };
-        // Near the origin fewer digits cancel.
-        let middle = track.stored(stored / 2)[0];
-        let mut per_frame = Vec::new();
-        for frame in 0..stored {
-            let mut sums = [0.0; 3];
-            for (joint, p) in track.stored(frame).iter().enumerate() {
-                let [x, y, z] = [p.x - middle.x, p.y, p.z - middle.z].map(f64::from);
-                for (axis, value) in [x, y, z].into_iter().enumerate() {
-                    columns.coordinates[axis][joint * stored + frame] = value;
-                }
-                sums[0] += x;
-                sums[1] += z;
-                sums[2] += x * x + y * y + z * z;
-            }
-            per_frame.push(sums);
-        }
-        let add = |a: [f64; 3], b: &[f64; 3]| [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
-        columns.sums = per_frame.windows(WINDOW).map(|w| w.iter().fold([0.0; 3], add)).collect();
-        columns
-    }
-}
-
-/// Distances of one ordered pair of clips: row is `from_frame`, column is `to_frame`.
-struct Table {
-    from: usize,
-    to: usize,
-    rows: usize,
-    columns: usize,
-    distances: Vec<f32>,
-}
-
-impl Table {
-    fn new(from: usize, to: usize, a: &Columns, b: &Columns) -> Self {
-        let products = Products::new(a, b);
-        let n = (a.joints * WINDOW) as f64;
-        let mut distances = Vec::with_capacity(a.frames * b.frames);
-        for row in 0..a.frames {
-            // The window around the frame that would follow.
-            let [sx, sz, source] = a.sums[row + 1];
-            for column in 0..b.frames {
-                let [tx, tz, target] = b.sums[column];
-                let [cos, sin, up] = products.window(row + 1, column);
-                let cos = cos - (sx * tx + sz * tz) / n;
-                let sin = sin - (sx * tz - sz * tx) / n;
-                let means = (sx * sx + sz * sz + tx * tx + tz * tz) / n;
-                let squares = source + target - 2.0 * up - means;
-                let left = (squares - 2.0 * cos.hypot(sin)).max(0.0);
-                distances.push((left / n).sqrt() as f32);
-            }
-        }
-        Self { from, to, rows: a.frames, columns: b.frames, distances }
-    }
-
-    fn at(&self, row: usize, column: usize) -> f32 {
-        self.distances[row * self.columns + column]
-    }
-
-    fn transition(&self, row: usize, column: usize) -> Transition {
-        Transition {
-            from_clip: self.from,
-            from_frame: row,
-            to_clip: self.to,
-            to_frame: column,
-            distance_m: self.at(row, column),
-        }
-    }
-
-    /// Whether a transition may be there at all.
-    fn allowed(&self, row: usize, column: usize) -> bool {
-        let far = self.from != self.to || (row + 1).abs_diff(column) >= SAME_CLIP_FRAMES;
-        far && row >= MARGIN_FRAMES && column + MARGIN_FRAMES < self.columns
-    }
-
-    fn best(&self, inside: impl Fn(usize, usize) -> bool) -> Option<Transition> {
-        let cells = (0..self.rows).flat_map(|row| (0..self.columns).map(move |c| (row, c)));
-        let cells = cells.filter(|(row, column)| self.allowed(*row, *column));
-        let cells = cells.filter(|(row, column)| inside(*row, *column));
-        cells.map(|(row, column)| self.transition(row, column)).min_by(nearer)
-    }
-
-    fn minima(&self) -> Vec<Transition> {
-        let mut minima = Vec::new();
-        for row in 0..self.rows {
-            for column in 0..self.columns {
-                if self.allowed(row, column) && self.is_minimum(row, column) {
-                    minima.push(self.transition(row, column));
-                }
-            }
-        }
-        minima
-    }
-
-    /// The best place to go on, of every row that has one near enough.
-    fn row_minima(&self) -> Vec<Transition> {
-        let best = |row: usize| {
-            let columns = (0..self.columns).filter(|column| self.allowed(row, *column));
-            columns.map(|column| self.transition(row, column)).min_by(nearer)
-        };
-        let near = |t: &Transition| t.distance_m < DISTANCE_M_MAX;
-        (0..self.rows).filter_map(best).filter(near).collect()
-    }
-
-    /// Smaller than its eight neighbours; of equals the first counts.
-    fn is_minimum(&self, row: usize, column: usize) -> bool {
-        let here = self.at(row, column);
-        let rows = row.saturating_sub(1)..=(row + 1).min(self.rows - 1);
-        rows.into_iter().all(|r| {
-            let columns = column.saturating_sub(1)..=(column + 1).min(self.columns - 1);
-            columns.into_iter().all(|c| match (r, c).cmp(&(row, column)) {
-                Ordering::Equal => true,
-                Ordering::Less => here < self.at(r, c),
-                Ordering::Greater => here <= self.at(r, c),
-            })
-        })
-    }
-}
-
-/// Per pair of stored frames, sums over the joints: x x' + z z', x z' - z x', y y'.
-struct Products {
-    stored: usize,
-    sums: Vec<[f64; 3]>,
-}
-
-impl Products {
-    fn new(a: &Columns, b: &Columns) -> Self {
-        let mut sums = Vec::with_capacity(a.stored * b.stored);
-        let [mut cos, mut sin, mut up] = [(); 3].map(|()| vec![0.0f64; b.stored]);
-        for frame in 0..a.stored {
-            for total in [&mut cos, &mut sin, &mut up] {
-                total.fill(0.0);
-            }
-            for joint in 0..a.joints {
-                let [x, y, z] = [0, 1, 2].map(|c| a.coordinates[c][joint * a.stored + frame]);
-                let of_b = |c: usize| &b.coordinates[c][joint * b.stored..][..b.stored];
-                let (bx, by, bz) = (of_b(0), of_b(1), of_b(2));
-                for i in 0..b.stored {
-                    cos[i] += x * bx[i] + z * bz[i];
-                    sin[i] += x * bz[i] - z * bx[i];
-                    up[i] += y * by[i];
-                }
-            }
-            sums.extend((0..b.stored).map(|i| [cos[i], sin[i], up[i]]));
-        }
-        Self { stored: b.stored, sums }
-    }
-
-    /// Summed over the windows that begin at these stored frames.
-    fn window(&self, a: usize, b: usize) -> [f64; 3] {
-        let mut total = [0.0; 3];
-        for k in 0..WINDOW {
-            let sums = self.sums[(a + k) * self.stored + b + k];
-            for (t, s) in total.iter_mut().zip(sums) {
-                *t += s;
-            }
-        }
-        total
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::{align, synthetic};
+    use super::super::synthetic;
     use super::*;
-
-    #[test]
-    fn the_table_holds_the_distances_of_the_fit() {
-        let (skeleton, clips) = synthetic::two_walks();
-        let tracks = transition::tracks(&skeleton, &clips);
-        let columns: Vec<_> = tracks.iter().map(Columns::new).collect();
-        let table = Table::new(0, 1, &columns[0], &columns[1]);
-        for (row, column) in [(0, 0), (17, 3), (59, 40), (30, 59)] {
-            let fit = align::fit(tracks[0].window(row + 1), tracks[1].window(column));
-            assert!((table.at(row, column) - fit.distance_m).abs() < 1e-5);
-        }
-    }
 
     #[test]
     fn any_density_is_strongly_connected_and_denser_reaches_faster() {

@@ -11,6 +11,8 @@ pub mod character;
 pub mod check;
 pub mod components;
 pub mod compute;
+mod distances;
+pub mod exits;
 pub mod garment;
 pub mod gltf_file;
 mod layers;

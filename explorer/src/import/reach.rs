@@ -28,7 +28,8 @@ impl Reach {
             (!pose.transition).then_some(usize::from(pose.clip))
         };
         let all: Vec<usize> = (0..primary.clips().len()).collect();
-        Self::measure(&graph, &clip_of, &all, primary.fps())
+        let clips: Vec<_> = (0..graph.node_count()).map(clip_of).collect();
+        Self::measure(&graph, &clips, |_| true, &all, primary.fps())
     }
 
     /// Of clips and transitions, over the component that would be kept.
@@ -37,7 +38,8 @@ impl Reach {
         Self::to_clips(frames, transitions, fps, &all)
     }
 
-    /// As [`Reach::of_clips`], of walks to these clips alone.
+    /// As [`Reach::of_clips`], of walks from recorded frames of these clips to another of them; where only
+    /// one is named, from those of all clips.
     pub fn to_clips(frames: &[usize], transitions: &[Transition], fps: f32, to: &[usize]) -> Self {
         let topology = Topology::new(frames, transitions, true);
         let graph = topology.digraph();
@@ -51,21 +53,28 @@ impl Reach {
         let ends: Vec<u32> =
             (0..frames.len()).map(|clip| topology.clip_first[clip] + frames[clip] as u32).collect();
         let clip_of = |node: usize| ends.iter().position(|end| kept[node] < *end);
-        Self::measure(&Digraph::new(kept.len(), &edges), &clip_of, to, fps)
+        let starts = |clip: Option<usize>| match to {
+            _ if to.len() == frames.len() => true,
+            [_] => clip.is_some(),
+            _ => clip.is_some_and(|clip| to.contains(&clip)),
+        };
+        let clips: Vec<_> = (0..kept.len()).map(clip_of).collect();
+        Self::measure(&Digraph::new(kept.len(), &edges), &clips, starts, to, fps)
     }
 
     fn measure(
         graph: &Digraph,
-        clip_of: &dyn Fn(usize) -> Option<usize>,
+        clip: &[Option<usize>],
+        starts: impl Fn(Option<usize>) -> bool,
         to: &[usize],
         fps: f32,
     ) -> Self {
-        let clip: Vec<Option<usize>> = (0..graph.node_count()).map(clip_of).collect();
         let mut steps = Vec::new();
         for &target in to {
             let inside = |node: &u32| clip[*node as usize] == Some(target);
             let targets: Vec<u32> = (0..graph.node_count() as u32).filter(inside).collect();
-            steps.extend(graph.steps_to(&targets).into_iter().filter(|s| *s > 0));
+            let all = graph.steps_to(&targets).into_iter().zip(clip);
+            steps.extend(all.filter(|(s, clip)| *s > 0 && starts(**clip)).map(|(s, _)| s));
         }
         steps.sort_unstable();
         let quantile = |share: f32| match steps.len() {

@@ -166,6 +166,23 @@ fn a_graph_computed_from_the_clips_keeps_nearly_all_of_them() {
 }
 
 #[test]
+fn gaits_are_answered_in_half_a_second_by_few_transitions_that_fit() {
+    let Some(data) = data() else { return };
+    let file = scene_graph("dress-agile", Some(&data), None, &[]).unwrap();
+    let Character { clips, .. } = character(&data);
+    let frames: Vec<usize> = clips.iter().map(|c| c.poses.len()).collect();
+    let transitions = file.resolve(&clips, 30.0).unwrap();
+    let gaits = ["walk_figure8", "run_figure8", "walk_backward", "sidestep", "turn_left"];
+    let gaits = gaits.map(|name| clips.iter().position(|c| c.name == name).unwrap());
+    let reach = reach::Reach::to_clips(&frames, &transitions, 30.0, &gaits);
+    assert!(reach.median_s <= 0.5 && reach.p90_s < 0.7, "{reach:?}");
+    assert!(transitions.len() < 700, "{}", transitions.len());
+    let mut distances: Vec<f32> = transitions.iter().map(|t| t.distance_m).collect();
+    distances.sort_by(f32::total_cmp);
+    assert!(distances[distances.len() / 2] < 0.15, "median {}", distances[distances.len() / 2]);
+}
+
+#[test]
 fn transitions_move_no_faster_than_the_clips_around_them() {
     let Some(data) = data() else { return };
     let Character { body, clips } = character(&data);
