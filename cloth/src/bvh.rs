@@ -4,7 +4,7 @@ use glam::{Vec3, Vec3A};
 
 use crate::triangle::{self, OnTriangle};
 
-pub(crate) const LEAF_TRIANGLES: usize = 4;
+const LEAF_TRIANGLES: usize = 4;
 /// Deep enough for 2^32 triangles halved at the median.
 const STACK: usize = 64;
 
@@ -17,6 +17,8 @@ pub struct Bvh {
     order: Vec<u32>,
     /// Vertices of the triangles in that order.
     corners: Vec<[u32; 3]>,
+    /// Place of each triangle in that order.
+    places: Vec<u32>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,7 +52,11 @@ impl Bvh {
     pub fn new(positions: &[Vec3], triangles: &[[u32; 3]]) -> Self {
         let (nodes, order) = split(positions, triangles);
         let corners = order.iter().map(|t| triangles[*t as usize]).collect();
-        Self { nodes, order, corners }
+        let mut places = vec![0; order.len()];
+        for (place, t) in order.iter().enumerate() {
+            places[*t as usize] = place as u32;
+        }
+        Self { nodes, order, corners, places }
     }
 
     /// Boxes and corners of the mesh in another pose; no allocation once `fit` is warm.
@@ -75,9 +81,29 @@ impl Bvh {
     /// The closest point nearer than `sqrt(limit2)`, if there is one. Of equals the one that
     /// the tree holds first.
     pub fn closest(&self, fit: &Fit, point: Vec3, limit2: f32) -> Option<Hit> {
+        self.closest_from(fit, point, limit2, None)
+    }
+
+    /// The same, faster where `near` is a triangle that may be near. Of equals it is that one.
+    pub fn closest_from(
+        &self,
+        fit: &Fit,
+        point: Vec3,
+        limit2: f32,
+        near: Option<u32>,
+    ) -> Option<Hit> {
         let point = Vec3A::from(point);
         let mut best = limit2;
         let mut hit = None;
+        if let Some(triangle) = near {
+            let on =
+                triangle::closest(&fit.corners[self.places[triangle as usize] as usize], point);
+            let distance2 = on.point.distance_squared(point);
+            if distance2 < best {
+                best = distance2;
+                hit = Some(Hit { triangle, on, distance2 });
+            }
+        }
         let mut stack = [(0u32, 0.0f32); STACK];
         let mut depth = 0;
         if !self.nodes.is_empty() {

@@ -38,15 +38,22 @@ impl Crossings {
 
     /// Every crossing at `positions` (m), ascending; allocates nothing once warm.
     pub fn find(&mut self, positions: &[Vec3]) -> &[Crossing] {
-        find(&self.tree, &mut self.fit, positions, &mut self.found);
+        find(&self.tree, &mut self.fit, positions, false, &mut self.found);
         &self.found
     }
 }
 
-pub(crate) fn find(tree: &Tree, fit: &mut Fit, positions: &[Vec3], out: &mut Vec<Crossing>) {
+/// With `smooth` without looking inside smooth patches; see [`Tree::pairs`].
+pub(crate) fn find(
+    tree: &Tree,
+    fit: &mut Fit,
+    positions: &[Vec3],
+    smooth: bool,
+    out: &mut Vec<Crossing>,
+) {
     out.clear();
     tree.fit(tree::at(positions), |_| Vec3A::ZERO, fit);
-    tree.pairs(fit, 0.0, false, |_, i, j| {
+    tree.pairs(fit, 0.0, smooth, |_, i, j| {
         for (of, against) in [(i, j), (j, i)] {
             let (sides, triangle) = (tree.corners[of as usize], tree.corners[against as usize]);
             for k in 0..3 {

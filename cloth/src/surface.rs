@@ -91,7 +91,18 @@ impl Surface {
     /// The closest point within `reach` (m) of `point`, if any. The side is told by the
     /// angle-weighted pseudo-normal of the closest feature (Baerentzen & Aanaes 2005).
     pub fn closest(&self, posed: &Posed, point: Vec3, reach: f32) -> Option<Contact> {
-        let hit = self.bvh.closest(&posed.fit, point, reach * reach)?;
+        self.closest_from(posed, point, reach, None)
+    }
+
+    /// The same, faster where `near` is a triangle that may be near. Of equals it is that one.
+    pub fn closest_from(
+        &self,
+        posed: &Posed,
+        point: Vec3,
+        reach: f32,
+        near: Option<u32>,
+    ) -> Option<Contact> {
+        let hit = self.bvh.closest_from(&posed.fit, point, reach * reach, near)?;
         Some(self.contact(posed, point, &hit))
     }
 

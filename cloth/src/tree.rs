@@ -6,10 +6,12 @@
 
 use glam::{Vec3, Vec3A};
 
-use crate::bvh::{self, LEAF_TRIANGLES, Node};
+use crate::bvh::{self, Node};
 use crate::mesh::Mesh;
 
 const NONE: u32 = u32::MAX;
+/// Largest patch that counts as smooth as a whole: too small for its outline to meet itself.
+const PATCH_TRIANGLES: u32 = 32;
 /// Smallest cosine between a smooth patch's normals and their mean.
 const SMOOTH: f32 = 0.4;
 
@@ -29,8 +31,16 @@ pub(crate) struct Tree {
     pub(crate) owns: Vec<u8>,
     /// For each edge of the mesh the vertices of its triangles that it does not have.
     opposites: Vec<[Option<u32>; 2]>,
-    /// For each node whether it is a leaf whose triangles hang together by their sides.
+    /// First slot of each node, and the one after its last.
+    slots: Vec<[u32; 2]>,
+    /// For each node whether it is a patch of at most [`PATCH_TRIANGLES`] that hang together by
+    /// their sides.
     whole: Vec<bool>,
+    /// Patches that share a side with patch n and have greater numbers:
+    /// `beside[first_beside[n]..first_beside[n + 1]]`. Only such as are met together on the way
+    /// down.
+    beside: Vec<u32>,
+    first_beside: Vec<u32>,
 }
 
 /// The tree fitted to a motion.
@@ -42,6 +52,10 @@ pub(crate) struct Fit {
     pub(crate) normals: Vec<[Vec3A; 2]>,
     /// For each vertex the sum of the normals around it, and whether they all lie near that.
     around: Vec<(Vec3A, bool)>,
+    /// For each patch the sum of its normals.
+    axes: Vec<Vec3A>,
+    /// For each node whether something below it is to be met; empty: all is.
+    busy: Vec<bool>,
     stack: Vec<[u32; 2]>,
 }
 
@@ -91,14 +105,58 @@ impl Tree {
             across: across(mesh, &corners),
             owns: owners(mesh, &corners),
             opposites: opposites(mesh),
+            slots: slots_of(&nodes),
             whole: Vec::new(),
+            beside: Vec::new(),
+            first_beside: Vec::new(),
             vertices: mesh.vertex_count(),
             nodes,
             order,
             corners,
         };
-        tree.whole = tree.nodes.iter().map(|n| tree.hangs_together(n)).collect();
+        tree.whole = tree.slots.iter().map(|range| tree.hangs_together(*range)).collect();
+        tree.find_beside();
         tree
+    }
+
+    /// Lists the patches that share sides, depth by depth. Leaves are opened no further, so they
+    /// are met with all that is deeper, too.
+    fn find_beside(&mut self) {
+        let mut pairs: Vec<[u32; 2]> = Vec::new();
+        let mut level = if self.nodes.is_empty() { Vec::new() } else { vec![0u32] };
+        let mut owner = vec![0u32; self.corners.len()];
+        loop {
+            for node in &level {
+                let [first, end] = self.slots[*node as usize];
+                owner[first as usize..end as usize].fill(*node);
+            }
+            for (slot, across) in self.across.iter().enumerate() {
+                for other in across.iter().filter(|other| **other != NONE) {
+                    let [a, b] = [owner[slot], owner[*other as usize]];
+                    if a < b && self.whole[a as usize] && self.whole[b as usize] {
+                        pairs.push([a, b]);
+                    }
+                }
+            }
+            if level.iter().all(|n| self.nodes[*n as usize].count > 0) {
+                break;
+            }
+            let open = |n: &u32| {
+                let node = self.nodes[*n as usize];
+                if node.count > 0 { vec![*n] } else { vec![*n + 1, node.link] }
+            };
+            level = level.iter().flat_map(open).collect();
+        }
+        pairs.sort_unstable();
+        pairs.dedup();
+        self.first_beside = vec![0; self.nodes.len() + 1];
+        for [a, _] in &pairs {
+            self.first_beside[*a as usize + 1] += 1;
+        }
+        for n in 0..self.nodes.len() {
+            self.first_beside[n + 1] += self.first_beside[n];
+        }
+        self.beside = pairs.into_iter().map(|[_, b]| b).collect();
     }
 
     /// The vertices opposite to an edge in its one or two triangles.
@@ -106,28 +164,26 @@ impl Tree {
         self.opposites[edge_of(mesh, edge[0], edge[1])]
     }
 
-    fn hangs_together(&self, node: &Node) -> bool {
-        let mut seen = [false; LEAF_TRIANGLES];
-        let mut todo = [node.link; 3 * LEAF_TRIANGLES + 1];
-        let mut left = usize::from(node.count > 0);
-        while left > 0 {
-            left -= 1;
-            let slot = todo[left];
-            if !std::mem::replace(&mut seen[(slot - node.link) as usize], true) {
-                let inside = |s: &&u32| (node.link..node.link + node.count).contains(*s);
-                for next in self.across[slot as usize].iter().filter(inside) {
-                    todo[left] = *next;
-                    left += 1;
-                }
+    fn hangs_together(&self, [first, end]: [u32; 2]) -> bool {
+        if end - first > PATCH_TRIANGLES {
+            return false;
+        }
+        let mut seen = [false; PATCH_TRIANGLES as usize];
+        let mut todo = vec![first];
+        while let Some(slot) = todo.pop() {
+            if !std::mem::replace(&mut seen[(slot - first) as usize], true) {
+                let inside = |s: &&u32| (first..end).contains(*s);
+                todo.extend(self.across[slot as usize].iter().filter(inside));
             }
         }
-        node.count > 0 && seen.iter().filter(|s| **s).count() == node.count as usize
+        seen.iter().filter(|s| **s).count() == (end - first) as usize
     }
 
     /// Fits the tree to vertices that begin at `at` and go by `way`; no allocation once warm.
     pub(crate) fn fit(&self, at: impl Fn(u32) -> Vec3A, way: impl Fn(u32) -> Vec3A, fit: &mut Fit) {
         fit.slots.clear();
         fit.normals.clear();
+        fit.busy.clear();
         for corners in &self.corners {
             let (p, w) = (corners.map(&at), corners.map(&way));
             fit.slots.push(Bounds::of(p, w));
@@ -136,13 +192,34 @@ impl Tree {
         }
         self.fit_fans(fit);
         fit.nodes.resize(self.nodes.len(), Bounds::default());
+        fit.axes.resize(self.nodes.len(), Vec3A::ZERO);
         for i in (0..self.nodes.len()).rev() {
             let node = self.nodes[i];
-            fit.nodes[i] = if node.count == 0 {
-                fit.nodes[i + 1].with(&fit.nodes[node.link as usize])
+            if node.count == 0 {
+                let right = node.link as usize;
+                fit.nodes[i] = fit.nodes[i + 1].with(&fit.nodes[right]);
+                fit.axes[i] = fit.axes[i + 1] + fit.axes[right];
             } else {
-                let leaf = &fit.slots[node.link as usize..][..node.count as usize];
-                leaf[1..].iter().fold(leaf[0], |sum, b| sum.with(b))
+                let slots = node.link as usize..(node.link + node.count) as usize;
+                let leaf = &fit.slots[slots.clone()];
+                fit.nodes[i] = leaf[1..].iter().fold(leaf[0], |sum, b| sum.with(b));
+                fit.axes[i] = fit.normals[slots].iter().map(|[n, m]| *n + *m).sum();
+            }
+        }
+    }
+
+    /// Lets [`Tree::pairs`] meet only such pairs of which one has a busy vertex, until the next
+    /// fit.
+    pub(crate) fn restrict(&self, busy: &[bool], fit: &mut Fit) {
+        fit.busy.clear();
+        fit.busy.resize(self.nodes.len(), false);
+        for i in (0..self.nodes.len()).rev() {
+            let node = self.nodes[i];
+            fit.busy[i] = if node.count == 0 {
+                fit.busy[i + 1] || fit.busy[node.link as usize]
+            } else {
+                let leaf = &self.corners[node.link as usize..][..node.count as usize];
+                leaf.iter().flatten().any(|v| busy[*v as usize])
             };
         }
     }
@@ -175,9 +252,9 @@ impl Tree {
     /// Calls `met` for every two slots which may come within `reach` (m) of each other during the
     /// motion.
     ///
-    /// With `smooth`, triangles of a smooth patch are not compared: two leaves that share a side,
-    /// or the triangles around a vertex, while all their normals, before and after, lie within 66
-    /// degrees of their mean. Such a patch projects on its mean plane without folding, so nothing
+    /// With `smooth`, triangles of a smooth patch are not compared: one or two small patches that
+    /// share a side, or the triangles around a vertex, while all their normals, before and after,
+    /// lie within 66 degrees of their mean. Such a patch projects on its mean plane without folding, so nothing
     /// in it meets (Volino & Magnenat-Thalmann 1994; it is too small for its outline to close on
     /// itself). Two triangles at a common side are not compared while they are folded by less than
     /// a right angle.
@@ -193,11 +270,13 @@ impl Tree {
         stack.clear();
         stack.push([0, 0]);
         while let Some([a, b]) = stack.pop() {
+            let idle = !fit.busy.is_empty() && !fit.busy[a as usize] && !fit.busy[b as usize];
+            if idle || smooth && self.is_smooth(fit, a, b) {
+                continue;
+            }
             let (na, nb) = (self.nodes[a as usize], self.nodes[b as usize]);
             if na.count > 0 && nb.count > 0 {
-                if !(smooth && self.is_smooth(fit, a, b)) {
-                    self.leaves(fit, [na, nb], (reach, smooth), &mut met);
-                }
+                self.leaves(fit, [na, nb], (reach, smooth), &mut met);
                 continue;
             }
             if a == b {
@@ -253,19 +332,43 @@ impl Tree {
     }
 
     fn is_smooth(&self, fit: &Fit, a: u32, b: u32) -> bool {
-        let (na, nb) = (self.nodes[a as usize], self.nodes[b as usize]);
         if !self.whole[a as usize] || !self.whole[b as usize] {
             return false;
         }
-        let slots = |n: Node| n.link as usize..(n.link + n.count) as usize;
-        let in_b = |s: &u32| slots(nb).contains(&(*s as usize));
-        if a != b && !self.across[slots(na)].iter().flatten().any(in_b) {
+        let of = |n: u32| {
+            let [first, end] = self.slots[n as usize];
+            first as usize..end as usize
+        };
+        let (mut sum, mut count) = (fit.axes[a as usize], 2 * of(a).len());
+        if a != b {
+            let range = self.first_beside[a as usize]..self.first_beside[a as usize + 1];
+            if !self.beside[range.start as usize..range.end as usize].contains(&b) {
+                return false;
+            }
+            sum += fit.axes[b as usize];
+            count += 2 * of(b).len();
+        }
+        let length = sum.length();
+        if length <= SMOOTH * count as f32 {
             return false;
         }
-        let normals = || fit.normals[slots(na)].iter().chain(&fit.normals[slots(nb)]).flatten();
-        let axis = normals().fold(Vec3A::ZERO, |sum, n| sum + *n).normalize_or_zero();
-        normals().all(|n| n.dot(axis) > SMOOTH)
+        let axis = sum / length;
+        let flat = |[n, m]: &[Vec3A; 2]| n.dot(axis).min(m.dot(axis)) > SMOOTH;
+        fit.normals[of(a)].iter().all(flat) && (a == b || fit.normals[of(b)].iter().all(flat))
     }
+}
+
+/// The slots below each node.
+fn slots_of(nodes: &[Node]) -> Vec<[u32; 2]> {
+    let mut slots = vec![[0; 2]; nodes.len()];
+    for (i, node) in nodes.iter().enumerate().rev() {
+        slots[i] = if node.count > 0 {
+            [node.link, node.link + node.count]
+        } else {
+            [slots[i + 1][0], slots[node.link as usize][1]]
+        };
+    }
+    slots
 }
 
 fn across(mesh: &Mesh, corners: &[[u32; 3]]) -> Vec<[u32; 3]> {

@@ -75,11 +75,19 @@ pub(crate) struct Friction {
 }
 
 impl Near {
-    /// Looks at `point` within `reach` (m).
-    pub(crate) fn find(model: &Model, posed: &Posed, point: Vec3, reach: f32) -> Self {
+    /// Looks at `point` within `reach` (m), first at the triangle `first`.
+    pub(crate) fn find(
+        model: &Model,
+        posed: &Posed,
+        point: Vec3,
+        reach: f32,
+        first: Option<u32>,
+    ) -> Self {
         let Some(character) = &model.body else { return Self::default() };
         let surface = &character.surface;
-        let Some(c) = surface.closest(posed, point, reach) else { return Self::default() };
+        let Some(c) = surface.closest_from(posed, point, reach, first) else {
+            return Self::default();
+        };
         let deep = c.distance < -PINCH_DEPTH_M;
         Self {
             found: true,
@@ -89,6 +97,11 @@ impl Near {
             normal: c.normal,
             distance: c.distance,
         }
+    }
+
+    /// Where to look first the next time.
+    pub(crate) fn triangle(&self) -> Option<u32> {
+        self.found.then_some(self.triangle)
     }
 
     /// Whether the vertex is inside one part of the body by more than `depth` (m).

@@ -14,10 +14,10 @@ use crate::solver::self_contact::Rows as PairRows;
 pub(crate) struct Pattern {
     pub(crate) near: Rows,
     pub(crate) far: Rows,
-    /// What is stored of `near`.
+    /// The part of `near` right of the diagonal, in which the matrix is assembled.
     pub(crate) near_upper: Upper,
-    /// What is stored of `far`.
-    pub(crate) far_upper: Upper,
+    /// For each slot of `near` where its block is assembled.
+    places: Vec<Place>,
     /// For each triangle the places of its corner pairs 01, 02, 12.
     pub(crate) triangle_places: Vec<[Place; 3]>,
 }
@@ -49,9 +49,11 @@ pub(crate) struct Rows {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Matrix {
     pub(crate) diagonal: Vec<Mat3A>,
-    /// Right of the diagonal, column by column.
-    pub(crate) near: Vec<[f32; 9]>,
-    /// Right of the diagonal.
+    /// Right of the diagonal, column by column: where blocks are assembled.
+    pub(crate) upper: Vec<[f32; 9]>,
+    /// Slot by slot, column by column, and [`simd::PADDING`] zeros; see [`Matrix::mirror`].
+    pub(crate) near: Vec<f32>,
+    /// Slot by slot.
     pub(crate) far: Vec<f32>,
     /// What couples the vertices of pairs in contact; their diagonal blocks are in `diagonal`.
     pub(crate) pairs: PairRows,
@@ -147,14 +149,16 @@ impl Pattern {
         let across = mesh.hinges().iter().map(|h| (h.vertices[2], h.vertices[3]));
         let apart = across.filter(|(a, b)| a != b && near.slot(*a, *b).is_none());
         let far = Rows::new(count, apart.flat_map(|(a, b)| both(a, b)).collect());
-        let (near_upper, far_upper) = (Upper::new(&near), Upper::new(&far));
+        let near_upper = Upper::new(&near);
         let place = |a: u32, b: u32| {
             let slot = near_upper.rows.slot(a.min(b), a.max(b)).map_or(0, |s| s as u32);
             Place { slot, turned: a > b }
         };
         let places = |t: &[u32; 3]| [place(t[0], t[1]), place(t[0], t[2]), place(t[1], t[2])];
         let triangle_places = mesh.triangles().iter().map(places).collect();
-        Self { near, far, near_upper, far_upper, triangle_places }
+        let rows = (0..count).flat_map(|row| near.row(row).map(move |slot| (row as u32, slot)));
+        let places = rows.map(|(row, slot)| place(row, near.columns[slot])).collect();
+        Self { near, far, near_upper, places, triangle_places }
     }
 }
 
@@ -162,15 +166,31 @@ impl Matrix {
     /// Takes the size of a pattern; the values are whatever they were.
     pub(crate) fn size(&mut self, pattern: &Pattern) {
         self.diagonal.resize(pattern.near.count(), Mat3A::ZERO);
-        self.near.resize(pattern.near_upper.whole.len(), [0.0; 9]);
-        self.far.resize(pattern.far_upper.whole.len(), 0.0);
+        self.upper.resize(pattern.near_upper.whole.len(), [0.0; 9]);
+        self.near.resize(9 * pattern.near.columns.len() + simd::PADDING, 0.0);
+        self.far.resize(pattern.far.columns.len(), 0.0);
+    }
+
+    /// Writes what was assembled right of the diagonal to both sides of it: a product that reads
+    /// blocks in order is twice as fast as one that scatters.
+    pub(crate) fn mirror(&mut self, pattern: &Pattern) {
+        for (block, place) in self.near.chunks_exact_mut(9).zip(&pattern.places) {
+            let from = &self.upper[place.slot as usize];
+            if place.turned {
+                for (k, value) in block.iter_mut().enumerate() {
+                    *value = from[k % 3 * 3 + k / 3];
+                }
+            } else {
+                block.copy_from_slice(from);
+            }
+        }
     }
 
     /// Adds a block, given as for the pair's first vertex.
     #[inline(always)]
     pub(crate) fn add(&mut self, place: Place, block: &Mat3A) {
         let whole = block.to_cols_array();
-        let sum = &mut self.near[place.slot as usize];
+        let sum = &mut self.upper[place.slot as usize];
         for (k, sum) in sum.iter_mut().enumerate() {
             *sum += if place.turned { whole[k % 3 * 3 + k / 3] } else { whole[k] };
         }

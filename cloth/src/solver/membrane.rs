@@ -242,7 +242,9 @@ mod tests {
         let mut matrix = Matrix::default();
         matrix.size(&pattern);
         let c = Constants::new(material);
-        assemble(mesh, &pattern, c, 1.0, x, Sums { forces: &mut forces, matrix: &mut matrix });
+        let sums = Sums { forces: &mut forces, matrix: &mut matrix };
+        assemble(mesh, &pattern, c, 1.0, x, sums);
+        matrix.mirror(&pattern);
         (forces, matrix)
     }
 

@@ -216,10 +216,11 @@ impl Workspace {
 
     fn find_all(&mut self, model: &Model, dt: f32, body_way: f32) {
         self.near.clear();
-        for (x, v) in self.x.iter().zip(&self.v) {
+        for (i, (x, v)) in self.x.iter().zip(&self.v).enumerate() {
             let reach = contact::reach(model.material.offset, v.length() * dt, body_way);
             let reach = reach.max(DEPTH_FOUND_M);
-            self.near.push(Near::find(model, &self.from, (*x).into(), reach));
+            let home = model.homes.get(i).map(|home| home.triangle);
+            self.near.push(Near::find(model, &self.from, (*x).into(), reach, home));
         }
     }
 
@@ -293,7 +294,8 @@ impl Workspace {
             let reach = contact::reach(offset, self.dx[i].length(), body_way);
             let start = if self.near[i].found { self.near[i].distance } else { offset };
             let inside = (-start).max(0.0);
-            let near = Near::find(model, &self.to, at.into(), reach + inside);
+            let first = self.near[i].triangle();
+            let near = Near::find(model, &self.to, at.into(), reach + inside, first);
             self.near[i] = near;
             self.rows[i] = near.ended(&c.surface, &self.from, &self.to).keep(offset, start, dt);
         }
@@ -339,12 +341,12 @@ impl Workspace {
         let gravity = Vec3A::from(model.environment.gravity);
         let (matrix, bending) = (&mut self.matrix, &model.bending);
         matrix.pairs.0.clear();
-        for (block, slot) in matrix.near.iter_mut().zip(&model.pattern.near_upper.whole) {
+        for (block, slot) in matrix.upper.iter_mut().zip(&model.pattern.near_upper.whole) {
             let w = bending.near[*slot as usize] * scale;
             *block = [w, 0.0, 0.0, 0.0, w, 0.0, 0.0, 0.0, w];
         }
-        for (far, slot) in matrix.far.iter_mut().zip(&model.pattern.far_upper.whole) {
-            *far = bending.far[*slot as usize] * scale;
+        for (far, exact) in matrix.far.iter_mut().zip(&bending.far) {
+            *far = exact * scale;
         }
         for (i, (d, w)) in matrix.diagonal.iter_mut().zip(&bending.diagonal).enumerate() {
             let inertia = model.masses[i] / (dt * dt);
@@ -356,6 +358,7 @@ impl Workspace {
         let (mesh, pattern) = (&model.mesh, &model.pattern);
         let sums = membrane::Sums { forces: &mut self.forces, matrix: &mut *matrix };
         membrane::assemble(mesh, pattern, constants, scale, &self.x, sums);
+        matrix.mirror(pattern);
     }
 
     /// Drag on each vertex's share of the sheet, along the sheet's normal.

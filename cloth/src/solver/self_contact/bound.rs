@@ -49,11 +49,7 @@ impl SelfContact {
         let mut done = Bounded::default();
         for _ in 0..LISTINGS {
             if self.has_strayed(model, x, ends) {
-                let mut way = std::mem::take(&mut self.way);
-                way.clear();
-                way.extend(ends.iter().zip(x).map(|(e, x)| *e - *x));
-                self.find(model, x, &way);
-                self.way = way;
+                self.find_strayed(model, x, ends);
             }
             if !self.push_apart(model, x, inverse_masses, ends, &mut done) {
                 done.lost = self.move_as_pieces(x, inverse_masses, ends, &mut done);
@@ -66,10 +62,13 @@ impl SelfContact {
     }
 
     /// Whether a vertex ends so far from where it was foreseen that unlisted pairs might meet.
-    fn has_strayed(&self, model: &Model, x: &[Vec3A], ends: &[Vec3A]) -> bool {
+    fn has_strayed(&mut self, model: &Model, x: &[Vec3A], ends: &[Vec3A]) -> bool {
         let most = 0.5 * (Self::reach(model) - FLOOR_M);
         let foreseen = x.iter().zip(&self.listed).map(|(x, way)| *x + *way);
-        ends.iter().zip(foreseen).any(|(e, f)| e.distance_squared(f) > most * most)
+        let far = |(e, f): (&Vec3A, Vec3A)| e.distance_squared(f) > most * most;
+        self.strayed.clear();
+        self.strayed.extend(ends.iter().zip(foreseen).map(far));
+        self.strayed.contains(&true)
     }
 
     /// Gauss-Seidel over the pairs that would meet, in turn with the edges that this stretches too

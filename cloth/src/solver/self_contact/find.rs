@@ -17,14 +17,35 @@ const WRONG_SIDE: f32 = -0.3;
 impl SelfContact {
     /// Lists the pairs whose distance at `x`, less their parts' relative `way`, is within reach.
     pub(crate) fn find(&mut self, model: &Model, x: &[Vec3A], way: &[Vec3A]) {
-        let tree = &model.tree;
-        let reach = Self::reach(model);
         self.listed.clear();
         self.listed.extend_from_slice(way);
+        self.pairs.clear();
+        self.list(model, x, false);
+    }
+
+    /// Lists the pairs of strayed vertices anew, for the ways to `ends`.
+    pub(crate) fn find_strayed(&mut self, model: &Model, x: &[Vec3A], ends: &[Vec3A]) {
+        for (i, strayed) in self.strayed.iter().enumerate() {
+            if *strayed {
+                self.listed[i] = ends[i] - x[i];
+            }
+        }
+        let strayed = &self.strayed;
+        self.pairs.retain(|p| !p.vertices.iter().any(|v| strayed[*v as usize]));
+        self.list(model, x, true);
+    }
+
+    /// Adds the pairs for the listed ways, or those of strayed vertices alone.
+    fn list(&mut self, model: &Model, x: &[Vec3A], strayed: bool) {
+        let (tree, reach) = (&model.tree, Self::reach(model));
         let mut pairs = std::mem::take(&mut self.pairs);
-        pairs.clear();
         let mut fit = std::mem::take(&mut self.fit);
+        let way = &self.listed;
         tree.fit(|v| x[v as usize], |v| way[v as usize], &mut fit);
+        if strayed {
+            tree.restrict(&self.strayed, &mut fit);
+        }
+        let old = pairs.len();
         let search = Search { model, tree, x, way, reach };
         tree.pairs(&mut fit, reach, true, |fit, i, j| {
             search.faces(fit, i, j, &mut pairs);
@@ -32,7 +53,12 @@ impl SelfContact {
             search.edges(fit, i, j, &mut pairs);
         });
         self.fit = fit;
-        pairs.retain(|p| !self.may_pass(p));
+        let mut place = 0;
+        pairs.retain(|p| {
+            place += 1;
+            let wanted = !strayed || p.vertices.iter().any(|v| self.strayed[*v as usize]);
+            place <= old || wanted && !self.may_pass(p)
+        });
         self.pairs = pairs;
     }
 }

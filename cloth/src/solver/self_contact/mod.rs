@@ -52,7 +52,8 @@ pub(crate) struct SelfContact {
     off: Vec<bool>,
     /// The ways for which the pairs were listed (m).
     listed: Vec<Vec3A>,
-    way: Vec<Vec3A>,
+    /// Vertices that ended far from where they were foreseen.
+    strayed: Vec<bool>,
     positions: Vec<Vec3>,
     crossings: Vec<Crossing>,
     shifts: Vec<(Vec3A, f32)>,
@@ -64,7 +65,7 @@ impl SelfContact {
     pub(crate) fn find_tangles(&mut self, model: &Model, x: &[Vec3A]) {
         self.positions.clear();
         self.positions.extend(x.iter().map(|p| Vec3::from(*p)));
-        crossings::find(&model.tree, &mut self.fit, &self.positions, &mut self.crossings);
+        crossings::find(&model.tree, &mut self.fit, &self.positions, true, &mut self.crossings);
     }
 
     /// Whether the cloth crossed itself when it was looked at last.
