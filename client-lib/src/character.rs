@@ -19,11 +19,13 @@ use crate::version::{Version, View};
 
 mod decode;
 mod look;
+mod outside;
 mod overlay;
 mod renew;
 
 pub use decode::decode;
 pub use look::Passed;
+use outside::Free;
 use overlay::Overlay;
 
 /// A step that takes longer than this counts as missed (design decision 11).
@@ -82,6 +84,9 @@ pub struct Character {
     sampled: Vec<f32>,
     phase: f32,
     overlay: Overlay,
+    free: Free,
+    /// Whether the basis changed since the last frame.
+    just_renewed: bool,
     placement: Placement,
     placement_before: Placement,
     scratch: Scratch,
@@ -123,6 +128,8 @@ impl Character {
             sampled: vec![0.0; columns],
             phase: 1.0,
             overlay: Overlay::default(),
+            free: Free::default(),
+            just_renewed: false,
             placement,
             placement_before: placement,
             scratch: Scratch::default(),
@@ -151,13 +158,17 @@ impl Character {
     pub fn step(&mut self, next_pose: PoseId) -> StepOutcome {
         let watch = Stopwatch::start();
         self.take_newer_view();
-        std::mem::swap(&mut self.before, &mut self.now);
-        self.overlay.begin_frame();
-        self.placement_before = self.placement;
-        self.passed = None;
         let scene = Arc::clone(self.view.version.scene());
         let edge = scene.edge_between(self.placement.pose(), next_pose);
+        self.leave_if_due(edge);
+        self.just_renewed = false;
+        std::mem::swap(&mut self.before, &mut self.now);
+        self.overlay.begin_frame();
+        self.free.run.begin_frame();
+        self.placement_before = self.placement;
+        self.passed = None;
         let mut outcome = match edge {
+            _ if self.free.run.is_on() => self.step_outside(edge, next_pose),
             Some(edge) => self.walk(edge),
             None => self.jump(next_pose),
         };
@@ -171,7 +182,7 @@ impl Character {
     }
 
     /// Coefficients between the last frame (`phase` 0) and this one (1), for screens that are
-    /// faster than the scene; [`decode`], [`Character::placement`] and
+    /// faster than the scene (outside the graph [`decode`] alone says where cloth is); [`decode`], [`Character::placement`] and
     /// [`Character::world_pose`] then speak of the same instant. After a step the phase is 1.
     pub fn sample(&mut self, phase: f32) -> &[f32] {
         self.phase = phase.clamp(0.0, 1.0);
@@ -216,8 +227,11 @@ impl Character {
     }
 
     /// What is left in this frame of the errors of merges and switches, and the error of a
-    /// substitute, in metres.
+    /// substitute, in metres. Outside the graph: the upsampler's largest error on training motion.
     pub fn shown_error_m(&self) -> f32 {
+        if let Some(upsampled) = &self.free.run.upsampled {
+            return upsampled.upsampler().parts().max_m;
+        }
         let substitute = match self.shown_by {
             Shown::Substitute { error_m, .. } => error_m,
             Shown::Named | Shown::Last => 0.0,

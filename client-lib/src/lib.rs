@@ -57,6 +57,7 @@ pub mod client;
 pub mod clock;
 #[cfg(feature = "driver")]
 pub mod driver;
+pub mod free;
 pub mod loader;
 pub mod placement;
 pub mod prefetch;
@@ -76,6 +77,7 @@ pub use character::{Character, Passed, StepOutcome, decode};
 #[cfg(feature = "driver")]
 pub use client::{Client, ClientConfig, ClientError, Status};
 pub use cloth::Rigid;
+pub use free::{Outside, Push};
 pub use loader::Memory;
 pub use protocol::message::TagOutcome;
 pub use protocol::table::Entry;

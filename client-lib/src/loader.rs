@@ -19,6 +19,9 @@ use crate::scene::Scene;
 use crate::shared::Stage;
 use crate::telemetry::Batch;
 use crate::version::{Parts, Version, VersionError, View};
+use upsampled::Upsamplers;
+
+mod upsampled;
 
 /// Of the cache's budget, the share that is planned for; the rest is for what decoding adds.
 const PLANNED_SHARE: f32 = 0.8;
@@ -91,6 +94,8 @@ pub struct Memory {
     pub scene: usize,
     /// Basis columns.
     pub basis: usize,
+    /// The upsampler.
+    pub upsampler: usize,
 }
 
 impl Memory {
@@ -102,6 +107,7 @@ impl Memory {
             links: self.links + other.links,
             scene: self.scene + other.scene,
             basis: self.basis + other.basis,
+            upsampler: self.upsampler + other.upsampler,
         }
     }
 }
@@ -121,6 +127,7 @@ pub struct GarmentLoader {
     next_cache: Option<Cache>,
     plan: Plan,
     parts: PartsSoFar,
+    upsamplers: Upsamplers,
     /// Chunks that are broken or missing on the server; tried again with the next version.
     refused: BTreeSet<ChunkHash>,
     changed: bool,
@@ -156,6 +163,7 @@ impl GarmentLoader {
             next_cache: None,
             plan: Plan::default(),
             parts: PartsSoFar::default(),
+            upsamplers: Upsamplers::default(),
             refused: BTreeSet::new(),
             changed: false,
         }
@@ -235,7 +243,9 @@ impl GarmentLoader {
         let completed = self.complete_next();
         if let Some(version) = &self.current {
             let resident = Arc::new(self.cache.snapshot());
-            self.stage.show(Arc::new(View { version: Arc::clone(version), resident }));
+            let version = Arc::clone(version);
+            let (upsampled, probes) = self.upsampled().unzip();
+            self.stage.show(Arc::new(View { version, resident, upsampled, probes }));
         }
         completed
     }
@@ -266,6 +276,9 @@ impl GarmentLoader {
             let soon = if chunk.frames <= URGENT_FRAMES { Need::Urgent } else { Need::Soon };
             add(chunk.chunk, soon);
         }
+        if let Some(upsampler) = self.lacking_upsampler() {
+            add(upsampler, Need::Soon);
+        }
         // Whatever fits without pushing anything out.
         let mut filled = self.cache.resident_bytes() - self.cache.initial_bytes();
         filled += self.plan.fetch.iter().map(|ahead| ahead.chunk.bytes as usize).sum::<usize>();
@@ -295,6 +308,7 @@ impl GarmentLoader {
             links: pages + version.map_or(0, |version| version.link_bytes()),
             scene: version.map_or(0, |version| version.scene().resident_bytes()),
             basis: version.map_or(0, |version| version.basis().resident_bytes()),
+            upsampler: self.upsampler_bytes(),
         }
     }
 
@@ -322,6 +336,7 @@ impl GarmentLoader {
                 self.changed = true;
             }
         }
+        self.read_upsampler(chunk, bytes);
         self.read_regions(chunk, bytes)
     }
 

@@ -34,6 +34,15 @@ impl Placement {
         scene.pose(self.pose).moved(&self.clip)
     }
 
+    /// As [`Placement::world_pose`], into a pose that keeps its memory.
+    pub fn world_pose_into(&self, scene: &Scene, pose: &mut Pose) {
+        scene.pose_into(self.pose, pose);
+        pose.root = self.clip.point(pose.root);
+        if let Some(hips) = pose.rotations.first_mut() {
+            *hips = (self.clip.rotation * *hips).normalize();
+        }
+    }
+
     /// Walks along an edge: the target's clip is placed by the edge's alignment.
     pub fn walk(&mut self, scene: &Scene, edge: EdgeId) {
         self.clip = self.clip.after(&scene.alignment(edge));

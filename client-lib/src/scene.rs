@@ -138,6 +138,14 @@ impl Scene {
         Pose { root: pose.root, rotations: pose.rotations.iter().map(|q| rotation(*q)).collect() }
     }
 
+    /// As [`Scene::pose`], into a pose that keeps its memory.
+    pub fn pose_into(&self, pose: PoseId, out: &mut Pose) {
+        let pose = &self.poses[pose.index()];
+        out.root = pose.root;
+        out.rotations.clear();
+        out.rotations.extend(pose.rotations.iter().map(|q| rotation(*q)));
+    }
+
     /// The character's joints.
     pub fn skeleton(&self) -> &Skeleton {
         &self.skeleton

@@ -15,6 +15,12 @@ pub struct PlayStats {
     pub jumps: u64,
     /// Version switches that this character lived through.
     pub switches: u64,
+    /// Of the substituted frames, those outside the graph.
+    pub outside: u64,
+    /// How often it left the graph.
+    pub left: u64,
+    /// How often it came back.
+    pub entered: u64,
     /// Shown error per frame that was not missed, in metres: what is left of the errors of merges and
     /// switches under the blend, and the error of a substitute.
     pub shown_error_m: Histogram,
@@ -29,6 +35,9 @@ impl PlayStats {
         self.missed += other.missed;
         self.jumps += other.jumps;
         self.switches += other.switches;
+        self.outside += other.outside;
+        self.left += other.left;
+        self.entered += other.entered;
         self.shown_error_m.merge(&other.shown_error_m);
     }
 }

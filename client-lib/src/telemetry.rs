@@ -18,6 +18,8 @@ pub struct Batch {
     pub missed: u64,
     /// Poses that were no successor of the one before.
     pub jumps: u64,
+    /// Of the substituted frames, those outside the graph.
+    pub outside: u64,
 }
 
 impl Batch {
@@ -36,6 +38,7 @@ impl Batch {
         self.substituted += other.substituted;
         self.missed += other.missed;
         self.jumps += other.jumps;
+        self.outside += other.outside;
     }
 }
 

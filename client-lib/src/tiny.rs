@@ -172,7 +172,8 @@ pub fn view_with(version: &Arc<Version>, parts: &[u64], fixes: &[VertexFix]) -> 
         let region = Region::new(StateId(first), 2, rows).with_fixes(own);
         cache.insert(region_chunk(*part), vec![region], *part == 0, &BTreeSet::new());
     }
-    Arc::new(View { version: Arc::clone(version), resident: Arc::new(cache.snapshot()) })
+    let resident = Arc::new(cache.snapshot());
+    Arc::new(View { version: Arc::clone(version), resident, upsampled: None, probes: None })
 }
 
 /// A version as a publisher lays it down: its garment, and its chunks by name.

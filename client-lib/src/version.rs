@@ -11,6 +11,8 @@ use protocol::table::Entry;
 use protocol::{ChunkHash, GarmentId, LinkTable, NotTotal, PoseId, StateId, VersionNumber};
 
 use crate::cache::Resident;
+use crate::free::Upsampled;
+use crate::free::probe::Probes;
 use crate::scene::Scene;
 
 /// One garment of one version: everything but the coefficients.
@@ -169,4 +171,8 @@ pub struct View {
     pub version: Arc<Version>,
     /// The coefficients.
     pub resident: Arc<Resident>,
+    /// What cloth leaves the graph with, once it is here.
+    pub upsampled: Option<Arc<Upsampled>>,
+    /// How it finds back.
+    pub probes: Option<Arc<Probes>>,
 }

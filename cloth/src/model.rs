@@ -87,7 +87,7 @@ pub(crate) struct Character {
 }
 
 /// The whole state of a garment: nothing else is carried from frame to frame.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct State {
     /// World positions (m).
     pub positions: Vec<Vec3>,

@@ -108,6 +108,16 @@ pub enum ClientMessage {
         /// The dead end.
         state: StateId,
     },
+    /// Of the substituted steps reported, those outside the graph. Said only where there are any, so
+    /// that a server without upsamplers never meets it.
+    Outside {
+        /// The garment.
+        garment: GarmentId,
+        /// The version that was played.
+        version: VersionNumber,
+        /// Steps since the last report.
+        steps: u32,
+    },
 }
 
 /// What became of a tag.
@@ -262,7 +272,8 @@ impl ClientMessage {
             | Self::Cancel { .. }
             | Self::Applied { .. }
             | Self::Bye
-            | Self::Pin { .. } => Ok(()),
+            | Self::Pin { .. }
+            | Self::Outside { .. } => Ok(()),
         }
     }
 }

@@ -173,6 +173,9 @@ impl Session {
                 }
             }
             ServerEvent::Telemetry { telemetry, dropped } => self.count(&telemetry, dropped),
+            ServerEvent::Outside { steps } => {
+                self.shared.metrics.outside.inc_by(steps.into());
+            }
             ServerEvent::Closed { code, message } => self.closed = Some((code, message)),
         }
     }

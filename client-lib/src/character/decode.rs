@@ -30,20 +30,27 @@ pub fn decode(
     if out.len() != expected {
         return Err(ReconstructError::Output { expected, actual: out.len() });
     }
-    if instances.len() > 1 && instances.iter().all(|c| c.shares(first)) {
+    let in_graph = |c: &&Character| !c.free.run.shows_now && !c.free.run.shows_before;
+    if instances.len() > 1 && instances.iter().all(|c| c.shares(first) && in_graph(c)) {
         let stride = first.sampled.len();
         let all: Vec<f32> = instances.iter().flat_map(|c| c.sampled.iter().copied()).collect();
         let columns = columns.min(basis.columns());
         basis.reconstruct_batch(&all, stride, rows.clone(), columns, out)?;
     } else {
         for (character, out) in instances.iter().zip(out.chunks_exact_mut(rows.len().max(1))) {
+            if let Some(made) = character.sample_outside(rows.clone(), columns, out) {
+                made?;
+                continue;
+            }
             let basis = character.view.version.basis();
             let columns = columns.min(basis.columns());
             basis.reconstruct(&character.sampled, rows.clone(), columns, out)?;
         }
     }
     for (character, out) in instances.iter().zip(out.chunks_exact_mut(rows.len().max(1))) {
-        character.overlay.add_to(rows.clone(), out);
+        if in_graph(character) {
+            character.overlay.add_to(rows.clone(), out);
+        }
     }
     Ok(())
 }

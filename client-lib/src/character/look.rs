@@ -77,6 +77,7 @@ impl Character {
         let view = std::sync::Arc::clone(&self.view);
         let Some(state) = view.version.links().resume(state) else { return false };
         let Some(pose) = view.version.links().pose(state) else { return false };
+        self.stop_outside();
         self.blend.clear();
         self.passed = None;
         self.state = state;

@@ -29,8 +29,9 @@ impl Overlay {
         self.now.clear();
         if !self.carried.is_empty() {
             self.age += 1;
-            if self.age >= BLEND_FRAMES {
-                self.carried = Vec::new();
+            // Between the tenth frame and the one before something is left.
+            if self.age > BLEND_FRAMES {
+                self.carried.clear();
             }
         }
     }
@@ -61,14 +62,49 @@ impl Overlay {
         self.add_to(0..is.len(), &mut is);
         was.iter_mut().zip(&is).for_each(|(was, is)| *was -= is);
         (self.carried, self.age) = (was, 0);
-        let (vertices, _) = self.carried.as_chunks::<3>();
-        let square = |v: &[f32; 3]| v.iter().map(|x| x * x).sum::<f32>();
-        vertices.iter().map(square).fold(0.0, f32::max).sqrt()
+        largest_m(&self.carried)
+    }
+
+    /// Replaces rows (m) of reconstructed cloth, to which this frame's fixes are still to be added, by
+    /// what leads from there to `shown`; gives the largest distance of a vertex (m).
+    pub(super) fn offset_m(&self, shown: &[f32], rows: &mut [f32]) -> f32 {
+        for (vertex, offset) in &self.now {
+            let at = 3 * *vertex as usize;
+            if let Some(rows) = rows.get_mut(at..at + 3) {
+                rows.iter_mut().zip(offset).for_each(|(row, x)| *row += x);
+            }
+        }
+        rows.iter_mut().zip(shown).for_each(|(row, shown)| *row = shown - *row);
+        largest_m(rows)
+    }
+
+    /// From the next frame on these offsets (m, by row) decay; in this frame they are whole.
+    pub(super) fn carry_offset(&mut self, rows: &[f32]) {
+        self.carried.clear();
+        self.carried.extend_from_slice(rows);
+        self.age = 0;
+    }
+
+    /// Adds what belongs to this frame, or to the one before, as it is shown there.
+    pub(super) fn add_one(&self, now: bool, rows: Range<usize>, out: &mut [f32]) {
+        let (offsets, phase) = if now { (&self.now, 1.0) } else { (&self.before, 0.0) };
+        self.add(&[(offsets, 1.0)], phase, rows, out);
     }
 
     /// Adds everything to these rows of the sampled cloth (m).
     pub(super) fn add_to(&self, rows: Range<usize>, out: &mut [f32]) {
-        for (offsets, weight) in [(&self.before, 1.0 - self.phase), (&self.now, self.phase)] {
+        let both = [(&self.before, 1.0 - self.phase), (&self.now, self.phase)];
+        self.add(&both, self.phase, rows, out);
+    }
+
+    fn add(
+        &self,
+        parts: &[(&Vec<VertexOffset>, f32)],
+        phase: f32,
+        rows: Range<usize>,
+        out: &mut [f32],
+    ) {
+        for (offsets, weight) in parts.iter().copied() {
             if weight <= 0.0 {
                 continue;
             }
@@ -82,10 +118,18 @@ impl Overlay {
             }
         }
         if let Some(carried) = self.carried.get(rows) {
-            let weight = (BLEND_FRAMES - self.age) as f32 / BLEND_FRAMES as f32;
+            let age = (self.age as f32 - (1.0 - phase)).max(0.0);
+            let weight = (BLEND_FRAMES as f32 - age).max(0.0) / BLEND_FRAMES as f32;
             out.iter_mut().zip(carried).for_each(|(out, x)| *out += weight * x);
         }
     }
+}
+
+/// The longest of offsets given by row (m).
+fn largest_m(rows: &[f32]) -> f32 {
+    let (vertices, _) = rows.as_chunks::<3>();
+    let square = |v: &[f32; 3]| v.iter().map(|x| x * x).sum::<f32>();
+    vertices.iter().map(square).fold(0.0, f32::max).sqrt()
 }
 
 #[cfg(test)]

@@ -22,6 +22,7 @@ impl Character {
             return self.start_over(&view);
         }
         if old.version.lineage() != view.version.lineage() {
+            self.just_renewed = true;
             return self.change_basis(&old, &view);
         }
         if let Shown::Substitute { state, error_m } = self.shown_by {
@@ -94,6 +95,7 @@ impl Character {
 
     /// Nothing of the old version means anything in this one: another motion.
     fn start_over(&mut self, view: &View) {
+        self.stop_outside();
         self.blend.clear();
         self.state = view.version.links().resume(StateId(0)).unwrap_or(StateId(0));
         self.placement = Placement::at(view.version.start());

@@ -349,6 +349,7 @@ impl Driver {
                 missed: count(batch.missed),
                 jumps: count(batch.jumps),
             });
+            self.session.report_outside(*id, version, count(batch.outside));
         }
     }
 

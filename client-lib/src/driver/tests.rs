@@ -161,6 +161,7 @@ async fn serve(
                 ServerEvent::Cancel { .. }
                 | ServerEvent::Open { .. }
                 | ServerEvent::Pin(_)
+                | ServerEvent::Outside { .. }
                 | ServerEvent::Tag { .. } => {}
             }
         }

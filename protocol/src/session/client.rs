@@ -260,6 +260,13 @@ impl Client {
         self.say(ClientMessage::Telemetry(telemetry));
     }
 
+    /// Reports steps outside the graph, where there were any.
+    pub fn report_outside(&mut self, garment: GarmentId, version: VersionNumber, steps: u32) {
+        if steps > 0 {
+            self.say(ClientMessage::Outside { garment, version, steps });
+        }
+    }
+
     /// Asks that the explorer simulate at this dead end next; answered by [`ClientEvent::Tagged`]. Says
     /// `false`, and nothing else, while the line is down.
     pub fn tag(&mut self, garment: GarmentId, state: StateId) -> bool {
@@ -357,8 +364,7 @@ impl Client {
 
     /// Queues a message; drops it when the queue is full, which only reports can bring about.
     fn say(&mut self, message: ClientMessage) {
-        let is_report = matches!(message, ClientMessage::Telemetry(_));
-        let keeps = is_report || self.link == Link::Open;
+        let keeps = is_report(&message) || self.link == Link::Open;
         if keeps && self.outbox.len() < limits::OUTBOX_MAX {
             self.outbox.push_back(message);
         }
@@ -514,7 +520,7 @@ impl Client {
     fn disconnect(&mut self, now: Time, reason: SessionError) {
         self.incoming.clear();
         self.wants.ask_all_again();
-        self.outbox.retain(|message| matches!(message, ClientMessage::Telemetry(_)));
+        self.outbox.retain(is_report);
         self.pace = client_pace();
         let lasted_us = self.opened.take().map_or(0, |opened| now.0.saturating_sub(opened.0));
         if lasted_us >= limits::RECONNECT_US_MAX {
@@ -547,4 +553,9 @@ impl Client {
 fn client_pace() -> Allowance {
     let per_second = limits::MESSAGES_PER_SECOND_MAX / 2;
     Allowance::new(per_second, per_second / 2)
+}
+
+/// Whether a message outlives the line.
+fn is_report(message: &ClientMessage) -> bool {
+    matches!(message, ClientMessage::Telemetry(_) | ClientMessage::Outside { .. })
 }

@@ -57,6 +57,11 @@ pub enum ServerEvent {
         /// Traversals above the cap, dropped.
         dropped: u64,
     },
+    /// Of the substituted steps reported, those outside the graph.
+    Outside {
+        /// How many.
+        steps: u32,
+    },
     /// The client wants this version and no other: answer by [`Server::handle_pinned`].
     Pin(VersionNumber),
     /// Keep a tag, of a client that may set it: answer by [`Server::handle_tagged`].
@@ -308,6 +313,9 @@ impl Server {
                 self.events.push_back(ServerEvent::Pin(version));
             }
             (ClientMessage::Tag { garment, state }, _) => self.tag(now, garment, state),
+            (ClientMessage::Outside { steps, .. }, _) => {
+                self.events.push_back(ServerEvent::Outside { steps });
+            }
         }
     }
 

@@ -204,6 +204,7 @@ impl Pair {
                 | ServerEvent::Tag { .. }
                 | ServerEvent::Cancel { .. }
                 | ServerEvent::Telemetry { .. }
+                | ServerEvent::Outside { .. }
                 | ServerEvent::Closed { .. } => {}
             }
             self.server_events.push(event);
@@ -403,10 +404,17 @@ fn bye_ends_it_after_the_reports() {
         missed: 0,
         jumps: 1,
     });
+    pair.client.report_outside(GarmentId(0), VersionNumber(1), 0);
+    pair.client.report_outside(GarmentId(0), VersionNumber(1), 2);
     pair.client.close();
     pair.run(Time(2_000_000));
     assert_eq!(pair.reason(), Some(&SessionError::Done));
     assert_eq!(pair.client.poll_timeout(), None);
+    let outside = pair.server_events.iter().filter_map(|event| match event {
+        ServerEvent::Outside { steps } => Some(*steps),
+        _ => None,
+    });
+    assert_eq!(outside.collect::<Vec<_>>(), [2]);
     let reports = pair.server_events.iter().filter_map(|event| match event {
         ServerEvent::Telemetry { telemetry, dropped: 0 } => Some(telemetry),
         _ => None,
