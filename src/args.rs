@@ -453,6 +453,15 @@ pub struct CodecBench {
     /// At most so many states, whole regions spread evenly [default: all].
     #[arg(long)]
     pub states: Option<usize>,
+    /// Rows that have not begun after so many minutes are left out, and named.
+    #[arg(long, value_name = "MINUTES", default_value_t = 60)]
+    pub minutes: u32,
+    /// Instead: grow a graph in ten appended versions, and make a new basis at the end.
+    #[arg(long)]
+    pub generations: bool,
+    /// Also write the exact states, and the rounded coefficients, for other programs to code.
+    #[arg(long, value_name = "DIR")]
+    pub export: Option<PathBuf>,
     /// One JSON object on the last line of stdout.
     #[arg(long)]
     pub json: bool,

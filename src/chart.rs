@@ -43,7 +43,10 @@ pub fn run(a: &args::Chart) -> Result<()> {
                 work: a.work.clone(),
                 bound_mm: Some(10.0),
                 states: a.states,
-                json: false,
+                minutes: 60,
+                generations: false,
+                export: None,
+                json: true,
             };
             let json = serde_json::to_value(codec::measure(&bench)?)?;
             read(&json).context("codecs were measured")?

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use codec::VertexFix;
+use codec::toile::TIERS;
 use protocol::{ChunkHash, StateId};
 
 /// Coefficients of consecutive states, as decoded: 16 bits each, in steps of full scale.
@@ -19,7 +20,23 @@ pub struct Region {
     coefficients: Vec<i16>,
     /// Vertices that are moved after reconstruction, by state.
     fixes: Vec<VertexFix>,
+    /// Columns that carry most here, the first of them first: as many as the largest tier.
+    by_energy: Vec<u16>,
+    /// Largest vertex error (m) of each of [`TIERS`], where the publisher states it.
+    tier_errors_m: Option<[f32; TIERS.len()]>,
+    /// Largest vertex error (m), where only the leading columns are known so far.
+    leading_error_m: Option<f32>,
     chunk_use: Arc<AtomicU64>,
+}
+
+/// What a shorter list of columns shows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TierColumns<'a> {
+    /// The columns that carry most in the state's region, the first of them first; empty where
+    /// all of them are asked for or nothing is known.
+    pub columns: &'a [u16],
+    /// Largest vertex error (m) of the region with these, as the publisher measured it.
+    pub error_m: f32,
 }
 
 impl Region {
@@ -30,8 +47,30 @@ impl Region {
     pub fn new(first_state: StateId, columns: usize, coefficients: Vec<i16>) -> Self {
         assert!(columns > 0 && coefficients.len().is_multiple_of(columns), "whole rows");
         let state_count = coefficients.len() / columns;
-        let (fixes, chunk_use) = (Vec::new(), Arc::default());
-        Self { first_state, state_count, columns, coefficients, fixes, chunk_use }
+        Self {
+            first_state,
+            state_count,
+            columns,
+            coefficients,
+            fixes: Vec::new(),
+            by_energy: Vec::new(),
+            tier_errors_m: None,
+            leading_error_m: None,
+            chunk_use: Arc::default(),
+        }
+    }
+
+    /// With the columns that carry most, and the error (m) of each of [`TIERS`].
+    pub fn with_tiers(mut self, by_energy: &[u16], errors_m: Option<[f32; TIERS.len()]>) -> Self {
+        let kept = by_energy.len().min(TIERS[TIERS.len() - 1]);
+        self.by_energy = by_energy[..kept].to_vec();
+        self.tier_errors_m = errors_m;
+        self
+    }
+
+    /// With the error (m) of the leading columns, which are all that is known so far.
+    pub fn of_leading_columns(self, error_m: f32) -> Self {
+        Self { leading_error_m: Some(error_m), ..self }
     }
 
     /// With vertices that are moved after reconstruction, sorted by state.
@@ -52,7 +91,8 @@ impl Region {
     /// Memory held, in bytes.
     pub fn bytes(&self) -> usize {
         let fixes = size_of::<VertexFix>() * self.fixes.capacity();
-        size_of::<Self>() + 2 * self.coefficients.capacity() + fixes
+        let numbers = self.coefficients.capacity() + self.by_energy.capacity();
+        size_of::<Self>() + 2 * numbers + fixes
     }
 
     /// Whether a state lies here.
@@ -103,6 +143,23 @@ impl Resident {
         let first = region.fixes.partition_point(|fix| usize::from(fix.state) < index);
         let own = region.fixes[first..].iter().take_while(|fix| usize::from(fix.state) == index);
         out.extend(own.map(|fix| (fix.vertex, fix.offset_m)));
+    }
+
+    /// Which columns a tier of so many decodes for a state, and their error; `None` where the state
+    /// is not here or its publisher states no tiers.
+    pub fn tier(&self, state: StateId, columns: usize) -> Option<TierColumns<'_>> {
+        let region = self.find(state)?;
+        let errors_m = region.tier_errors_m?;
+        let Some(tier) = TIERS.iter().position(|tier| *tier >= columns) else {
+            return Some(TierColumns { columns: &[], error_m: 0.0 });
+        };
+        let kept = region.by_energy.len().min(TIERS[tier]);
+        Some(TierColumns { columns: &region.by_energy[..kept], error_m: errors_m[tier] })
+    }
+
+    /// Largest vertex error (m) of a state of which only the leading columns are known so far.
+    pub fn leading_error_m(&self, state: StateId) -> Option<f32> {
+        self.find(state)?.leading_error_m
     }
 
     fn find(&self, state: StateId) -> Option<&Region> {
@@ -278,6 +335,21 @@ mod tests {
         assert_eq!(out, [-1.0, 0.0, 0.0, 0.0]);
         region.expand(0, &mut out[..1]);
         assert_eq!(out[0], 1.0);
+    }
+
+    #[test]
+    fn a_tier_is_the_next_one_that_has_enough_columns() {
+        let mut cache = Cache::new(1 << 20);
+        let by_energy: Vec<u16> = (0..60).rev().collect();
+        let tiers = region(0, 1).with_tiers(&by_energy, Some([0.04, 0.03, 0.0, 0.0]));
+        cache.insert(hash(0), vec![tiers], true, &BTreeSet::new());
+        let resident = cache.snapshot();
+        let tier = |columns| resident.tier(StateId(1), columns).unwrap();
+        assert_eq!((tier(10).columns, tier(10).error_m), (&by_energy[..16], 0.04));
+        assert_eq!((tier(17).columns, tier(17).error_m), (&by_energy[..32], 0.03));
+        assert_eq!(tier(64).columns.len(), 60);
+        assert_eq!((tier(129).columns.len(), tier(129).error_m), (0, 0.0));
+        assert_eq!(resident.tier(StateId(9), 16), None);
     }
 
     #[test]

@@ -22,11 +22,13 @@ mod look;
 mod outside;
 mod overlay;
 mod renew;
+mod tier;
 
 pub use decode::decode;
 pub use look::Passed;
 use outside::Free;
 use overlay::Overlay;
+use tier::Active;
 
 /// A step that takes longer than this counts as missed (design decision 11).
 pub const STEP_LIMIT: Duration = Duration::from_millis(2);
@@ -87,6 +89,7 @@ pub struct Character {
     free: Free,
     /// Whether the basis changed since the last frame.
     just_renewed: bool,
+    active: Active,
     placement: Placement,
     placement_before: Placement,
     scratch: Scratch,
@@ -130,6 +133,7 @@ impl Character {
             overlay: Overlay::default(),
             free: Free::default(),
             just_renewed: false,
+            active: Active::default(),
             placement,
             placement_before: placement,
             scratch: Scratch::default(),
@@ -174,6 +178,9 @@ impl Character {
         };
         self.cursor.set(self.state);
         self.compose();
+        if let (StepOutcome::Exact, Some(error_m)) = (outcome, self.leading_error_m()) {
+            outcome = StepOutcome::Substituted { error_m };
+        }
         if watch.exceeds(STEP_LIMIT) {
             outcome = StepOutcome::Missed;
         }
@@ -226,8 +233,9 @@ impl Character {
         &self.stats
     }
 
-    /// What is left in this frame of the errors of merges and switches, and the error of a
-    /// substitute, in metres. Outside the graph: the upsampler's largest error on training motion.
+    /// What is left in this frame of the errors of merges and switches, the error of a substitute,
+    /// and that of columns left out or not here yet, in metres. Outside the graph: the upsampler's
+    /// largest error on training motion.
     pub fn shown_error_m(&self) -> f32 {
         if let Some(upsampled) = &self.free.run.upsampled {
             return upsampled.upsampler().parts().max_m;
@@ -236,7 +244,13 @@ impl Character {
             Shown::Substitute { error_m, .. } => error_m,
             Shown::Named | Shown::Last => 0.0,
         };
-        self.blend.error_m() + substitute
+        let columns = self.leading_error_m().unwrap_or(0.0).max(self.tier_error_m());
+        self.blend.error_m() + substitute + columns
+    }
+
+    /// The error of what is shown (m), where only the leading columns of the basis are here.
+    fn leading_error_m(&self) -> Option<f32> {
+        self.view.resident.leading_error_m(self.shown_state()?)
     }
 
     /// Goes on along an edge of the primary graph.
@@ -449,6 +463,7 @@ impl Character {
         self.overlay.sample(1.0);
         self.sampled.copy_from_slice(&self.now);
         self.phase = 1.0;
+        self.choose_columns();
     }
 
     fn count(&mut self, outcome: StepOutcome, edge: Option<EdgeId>) {

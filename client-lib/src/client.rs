@@ -12,7 +12,7 @@ use tokio::sync::Notify;
 
 use crate::character::Character;
 use crate::driver::{self, Fingerprint};
-use crate::loader::Memory;
+use crate::loader::{FirstCloth, Memory};
 use crate::prefetch::Horizon;
 use crate::scene::Scene;
 use crate::shared::Stage;
@@ -106,6 +106,8 @@ pub struct Status {
     pub connected: bool,
     /// The newest version that all its garments play.
     pub version: Option<VersionNumber>,
+    /// What the first cloth was shown with, where that was before the basis was whole.
+    pub first_cloth: Option<FirstCloth>,
     /// Versions taken up so far.
     pub versions_applied: u64,
     /// Whose versions are played.
@@ -262,6 +264,13 @@ impl Client {
             };
             Err(ClientError::NotReady { waited: timeout, detail })
         })
+    }
+
+    /// Waits until there is cloth to show, if only with the leading columns of the basis, or the
+    /// time is over; says which. Steps are counted as substituted until the basis is whole.
+    pub fn wait_first_cloth(&self, timeout: Duration) -> bool {
+        let done = |state: &State| (!state.stages.is_empty()).then_some(());
+        self.shared.wait(timeout, done).is_some()
     }
 
     /// Waits until what can be needed within the horizon ahead of all characters is resident, or

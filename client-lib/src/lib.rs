@@ -78,7 +78,7 @@ pub use character::{Character, Passed, StepOutcome, decode};
 pub use client::{Client, ClientConfig, ClientError, Status};
 pub use cloth::Rigid;
 pub use free::{Outside, Push};
-pub use loader::Memory;
+pub use loader::{FirstCloth, Memory};
 pub use protocol::message::TagOutcome;
 pub use protocol::table::Entry;
 pub use protocol::{GarmentId, PoseId, StateId, VersionNumber};

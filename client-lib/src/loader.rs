@@ -23,6 +23,10 @@ use upsampled::Upsamplers;
 
 mod upsampled;
 
+mod first_cloth;
+
+pub use first_cloth::FirstCloth;
+
 /// Of the cache's budget, the share that is planned for; the rest is for what decoding adds.
 const PLANNED_SHARE: f32 = 0.8;
 /// What lies at most this many frames ahead is urgent.
@@ -131,6 +135,8 @@ pub struct GarmentLoader {
     /// Chunks that are broken or missing on the server; tried again with the next version.
     refused: BTreeSet<ChunkHash>,
     changed: bool,
+    first_shown: bool,
+    first_cloth: Option<FirstCloth>,
 }
 
 /// What was read of the next version and kept of the current one.
@@ -166,6 +172,8 @@ impl GarmentLoader {
             upsamplers: Upsamplers::default(),
             refused: BTreeSet::new(),
             changed: false,
+            first_shown: false,
+            first_cloth: None,
         }
     }
 
@@ -232,7 +240,8 @@ impl GarmentLoader {
         }
     }
 
-    /// Shows what has become playable; says whether a new version is among it.
+    /// Shows what has become playable; says whether a new version is among it. Before the first
+    /// version is whole, its leading columns are shown.
     ///
     /// # Errors
     /// The next version's parts do not fit together; the current one is played on.
@@ -246,6 +255,8 @@ impl GarmentLoader {
             let version = Arc::clone(version);
             let (upsampled, probes) = self.upsampled().unzip();
             self.stage.show(Arc::new(View { version, resident, upsampled, probes }));
+        } else {
+            self.show_first_cloth();
         }
         completed
     }
@@ -260,7 +271,15 @@ impl GarmentLoader {
         };
         if let Some((_, next)) = &self.next {
             let cache = self.next_cache.as_ref().unwrap_or(&self.cache);
-            self.parts.lacking(next, |chunk| add(chunk, Need::Version));
+            // First cloth needs the leading columns alone: the others come after them.
+            let first = self.current.is_none();
+            let later = next.generations.iter().skip(1);
+            let later: BTreeSet<ChunkHash> =
+                later.filter(|_| first).map(|generation| generation.chunk.hash).collect();
+            self.parts.lacking(next, |chunk| {
+                let is_later = later.contains(&chunk.hash);
+                add(chunk, if is_later { Need::Urgent } else { Need::Version });
+            });
             let initial = next.regions.iter().filter(|region| region.initial);
             let here = |chunk| cache.contains(chunk) || self.parts.regions.contains_key(chunk);
             let lacking = initial.filter(|region| !here(&region.chunk.hash));
@@ -451,6 +470,19 @@ impl PartsSoFar {
     /// All parts of a version of which nothing is lacking; forgets what it does not need.
     fn parts(&mut self, number: VersionNumber, next: GarmentVersion) -> Result<Parts, LoadError> {
         let basis = self.basis(&next)?;
+        let parts = self.with_basis(number, next, basis)?;
+        let listed: BTreeSet<ChunkHash> = parts.garment.links.iter().map(|p| p.hash).collect();
+        self.pages.retain(|hash, _| listed.contains(hash));
+        Ok(parts)
+    }
+
+    /// All parts of a version, on this basis.
+    fn with_basis(
+        &self,
+        number: VersionNumber,
+        next: GarmentVersion,
+        basis: Arc<Basis>,
+    ) -> Result<Parts, LoadError> {
         let garment = next.id;
         let mut pages = Vec::with_capacity(next.links.len());
         for page in &next.links {
@@ -459,8 +491,6 @@ impl PartsSoFar {
             let page = LinkPage::decode(bytes);
             pages.push(page.map_err(|source| LoadError::Chunk { garment, chunk, source })?);
         }
-        let listed: BTreeSet<ChunkHash> = next.links.iter().map(|page| page.hash).collect();
-        self.pages.retain(|hash, _| listed.contains(hash));
         let lost = |chunk, what: &str| LoadError::Codec { garment, chunk, why: what.to_owned() };
         let scene = self.scene.as_ref().ok_or_else(|| lost(next.scene.hash, "no scene"))?;
         let mesh = self.mesh.as_ref().ok_or_else(|| lost(next.mesh.hash, "no mesh"))?;
@@ -515,6 +545,7 @@ fn decode(decoder: &Decoder, entry: &RegionEntry) -> Result<Option<Region>, Stri
         return Ok(None);
     }
     let decoded = Region::new(entry.first_state, region.columns, region.coefficients);
+    let decoded = decoded.with_tiers(&region.by_energy, region.tier_errors_m);
     Ok(Some(decoded.with_fixes(region.fixes)))
 }
 

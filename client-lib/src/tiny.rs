@@ -21,6 +21,9 @@ pub const STRIDE_M: f32 = 0.1;
 /// Metres of full scale of each column: the first along x, the second along y.
 pub const SCALE_M: f32 = 3.0;
 
+/// What the first column alone is said to cost in [`published_in_parts`] (m).
+pub const LEADING_ERROR_M: f32 = 0.05;
+
 /// Two poses of one joint, a stride along z apart; 1 -> 0 goes on straight after a turn.
 pub fn scene_chunk() -> SceneChunk {
     let pose = |frame: u32| Pose {
@@ -218,5 +221,66 @@ pub fn published(links: Vec<LinkEntry>) -> (GarmentVersion, BTreeMap<ChunkHash, 
         stats: VersionStats::default(),
         upsampler: None,
     };
+    (garment, chunks)
+}
+
+/// As [`published`] in profile `toile`, with a generation for each of the two columns.
+pub fn published_in_parts(links: Vec<LinkEntry>) -> (GarmentVersion, BTreeMap<ChunkHash, Vec<u8>>) {
+    use codec::toile::{self, Column, GenerationParts, Model, RegionParts, Tree};
+    let (mut garment, mut chunks) = published(links);
+    let mut put = |bytes: Vec<u8>| {
+        let chunk = ChunkRef { hash: ChunkHash::of(&bytes), bytes: bytes.len() as u32 };
+        chunks.insert(chunk.hash, bytes);
+        chunk
+    };
+    let column =
+        Column { maximum_m: SCALE_M, multiple: 1, sizes: [60; 3], after_one: 0, after_two: [0; 2] };
+    let (tree, mut model) = (Tree::sequence(1), Model::new(1));
+    garment.codec = toile::PROFILE.into();
+    garment.generations.clear();
+    for values_m in [[SCALE_M, 0.0, 0.0], [0.0, SCALE_M, 0.0]] {
+        let with_tree = garment.generations.is_empty();
+        let parts = GenerationParts {
+            step_m: 3e-4,
+            columns: &[column],
+            values_m: &values_m,
+            step: 20,
+            states: 4,
+            rms_m: 0.001,
+            tree: &tree,
+            with_tree,
+        };
+        let mut bytes = Vec::new();
+        toile::encode_generation(&parts, &mut bytes).unwrap();
+        garment.generations.push(GenerationRef { chunk: put(bytes), columns: 1 });
+        model.append(&[column]);
+    }
+    for region in &mut garment.regions {
+        let states = region.first_state.0..region.first_state.0 + u64::from(region.state_count);
+        let step_m = toile::step_m(20);
+        let steps: Vec<i32> = states
+            .flat_map(fractions)
+            .map(|fraction| (fraction * SCALE_M / step_m).round() as i32)
+            .collect();
+        let parts = RegionParts {
+            columns: 2,
+            step: 20,
+            coefficients: &steps,
+            fix_step: 0,
+            fixes: &[],
+            tier_errors_m: [0.0; 4],
+            leading_error_m: LEADING_ERROR_M,
+        };
+        let mut bytes = Vec::new();
+        toile::encode_region(&model, &parts, &mut bytes).unwrap();
+        let entry = RegionEntry {
+            first_state: region.first_state,
+            state_count: region.state_count as u16,
+            generation: GenerationId(1),
+            max_error_m: 0.0,
+            bytes,
+        };
+        region.chunk = put(RegionChunk { regions: vec![entry] }.encode());
+    }
     (garment, chunks)
 }

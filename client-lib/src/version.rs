@@ -24,6 +24,7 @@ pub struct Version {
     mesh: Arc<GarmentChunk>,
     basis: Arc<Basis>,
     links: LinkTable,
+    columns_to_come: usize,
 }
 
 /// The parts of a version, each read and checked on its own; shared with the version before
@@ -38,7 +39,7 @@ pub struct Parts {
     pub scene: Arc<Scene>,
     /// From the chunk `garment.mesh`.
     pub mesh: Arc<GarmentChunk>,
-    /// From all chunks of `garment.generations`.
+    /// From all chunks of `garment.generations`, or from the leading ones.
     pub basis: Arc<Basis>,
     /// From all chunks of `garment.links`, in order.
     pub pages: Vec<LinkPage>,
@@ -89,7 +90,9 @@ impl Version {
         }
         let links = LinkTable::new(&pages, scene.pose_count(), scene.edges())
             .map_err(|source| VersionError::NotTotal { number, garment: garment.id, source })?;
-        Ok(Self { number, garment, scene, mesh, basis, links })
+        let listed = garment.generations.iter().map(|g| usize::from(g.columns)).sum::<usize>();
+        let columns_to_come = listed.saturating_sub(basis.columns());
+        Ok(Self { number, garment, scene, mesh, basis, links, columns_to_come })
     }
 
     /// Its number.
@@ -117,9 +120,14 @@ impl Version {
         &self.mesh
     }
 
-    /// The basis, all generations.
+    /// The basis: all generations, or the leading ones where [`Version::columns_to_come`] says so.
     pub fn basis(&self) -> &Arc<Basis> {
         &self.basis
+    }
+
+    /// Columns that are still on their way: first cloth is shown with the leading ones.
+    pub fn columns_to_come(&self) -> usize {
+        self.columns_to_come
     }
 
     /// Which state follows which.

@@ -34,6 +34,14 @@ pub struct DecodedRegion {
     pub coefficients: Vec<i16>,
     /// Vertices that are moved after reconstruction, by state, then vertex.
     pub fixes: Vec<VertexFix>,
+    /// Columns that are not zero here, those that carry most first; empty in profile `kim2013`.
+    pub by_energy: Vec<u16>,
+    /// Largest vertex error (m) with the first [`toile::TIERS`] of `by_energy` alone, where the
+    /// region states it.
+    pub tier_errors_m: Option<[f32; toile::TIERS.len()]>,
+    /// Largest vertex error (m) with the first generation's columns alone, where the region states
+    /// it.
+    pub leading_error_m: Option<f32>,
 }
 
 /// A vertex of a state that is moved after reconstruction.
@@ -120,6 +128,9 @@ impl Decoder {
                 is_whole,
                 coefficients: region.coefficients().collect(),
                 fixes: Vec::new(),
+                by_energy: Vec::new(),
+                tier_errors_m: None,
+                leading_error_m: None,
             });
         };
         let region = toile::parse_region(bytes, &toile.model)?;
@@ -134,6 +145,9 @@ impl Decoder {
             columns: region.columns(),
             is_whole: region.is_whole(),
             fixes: region.fixes().iter().map(fix).collect(),
+            by_energy: region.by_energy().to_vec(),
+            tier_errors_m: Some(region.tier_errors_m()),
+            leading_error_m: region.leading_error_m(),
             coefficients: region.into_coefficients(),
         })
     }

@@ -83,6 +83,7 @@ fn region_bytes(model: &Model, seed: u64, states: usize, fixes: &[Fix]) -> (Vec<
         fix_step: 30,
         fixes,
         tier_errors_m: [0.04, 0.03, 0.02, 0.01],
+        leading_error_m: 0.035,
     };
     let mut bytes = Vec::new();
     encode_region(model, &parts, &mut bytes).unwrap();
@@ -120,6 +121,7 @@ fn region_bytes_are_golden() {
         fix_step: 30,
         fixes: &fixes(),
         tier_errors_m: [0.001; TIERS.len()],
+        leading_error_m: 0.002,
     };
     let mut bytes = Vec::new();
     encode_region(&model, &parts, &mut bytes).unwrap();
@@ -132,13 +134,24 @@ fn region_bytes_are_golden() {
         assert_eq!(*c, full(*q, if i % 2 == 0 { 3.0 } else { 1.5 }), "coefficient {i}");
     }
     assert_eq!(parsed.fixes(), fixes());
+    let leading_m = parsed.leading_error_m().unwrap();
+    assert!((0.002..0.0022).contains(&leading_m), "{leading_m}");
     assert_eq!(hex(&bytes), GOLDEN_REGION);
+    // Regions of version 1 stay readable for ever.
+    let old: Vec<u8> = (0..GOLDEN_REGION_1.len() / 2)
+        .map(|at| u8::from_str_radix(&GOLDEN_REGION_1[2 * at..2 * at + 2], 16).unwrap())
+        .collect();
+    let old = parse_region(&old, &model).unwrap();
+    assert_eq!((old.coefficients(), old.fixes()), (parsed.coefficients(), parsed.fixes()));
+    assert_eq!((old.tier_errors_m(), old.leading_error_m()), (parsed.tier_errors_m(), None));
 }
 
 const GOLDEN_GENERATION: &str = "5474426701000100060000000000003f0109000006000000050000000000803e\
     0000803f01493e3e660e9a19cdf47ffffb3ca70b";
-const GOLDEN_REGION: &str =
+const GOLDEN_REGION_1: &str =
     "0100020003281e010900090009000900150022852512b939a33eb9810ab46e754a69bb4e9a1d58";
+const GOLDEN_REGION: &str =
+    "0200020003281e0109000900090009001100150022852512b939a33eb9810ab46e754a69bb4e9a1d58";
 
 fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
@@ -214,6 +227,7 @@ fn what_does_not_fit_is_refused() {
         fix_step: 30,
         fixes: &[],
         tier_errors_m: [0.0; TIERS.len()],
+        leading_error_m: 9.0,
     };
     let refused = |parts: RegionParts<'_>| encode_region(&model, &parts, &mut Vec::new()).is_err();
     assert!(!refused(parts));

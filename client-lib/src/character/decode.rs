@@ -4,6 +4,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use codec::ReconstructError;
+use codec::kernel::Select;
 
 use super::Character;
 
@@ -11,7 +12,7 @@ use super::Character;
 ///
 /// * `rows`: which rows (x0, y0, z0, x1, ...; three per vertex).
 /// * `columns`: how many leading columns; fewer make a coarser state. More than there are means
-///   all of them.
+///   all of them. A character with a tier ([`Character::set_tier`]) decodes that tier's instead.
 /// * `out`: `rows.len()` numbers (metres) per character, one after another.
 ///
 /// A host calls this on its own threads. Characters that share a basis read it once for all.
@@ -43,8 +44,8 @@ pub fn decode(
                 continue;
             }
             let basis = character.view.version.basis();
-            let columns = columns.min(basis.columns());
-            basis.reconstruct(&character.sampled, rows.clone(), columns, out)?;
+            let select = character.select(columns);
+            basis.reconstruct(&character.sampled, rows.clone(), select, out)?;
         }
     }
     for (character, out) in instances.iter().zip(out.chunks_exact_mut(rows.len().max(1))) {
@@ -60,5 +61,6 @@ impl Character {
     fn shares(&self, other: &Self) -> bool {
         Arc::ptr_eq(self.view.version.basis(), other.view.version.basis())
             && self.sampled.len() == other.sampled.len()
+            && matches!(self.select(usize::MAX), Select::First(_))
     }
 }

@@ -32,7 +32,12 @@ impl Character {
             }
         }
         match view.version.links().resume(self.state) {
-            Some(state) if state == self.state => {}
+            Some(state) if state == self.state => {
+                // The rest of the basis has come: what it adds fades in.
+                if old.version.columns_to_come() > view.version.columns_to_come() {
+                    self.switch_to(&view, state);
+                }
+            }
             Some(state) => self.switch_to(&view, state),
             // This version has never heard of that state.
             None => {

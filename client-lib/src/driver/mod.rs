@@ -275,7 +275,12 @@ impl Driver {
         let mut any_new = false;
         let mut refused = None;
         for loader in self.loaders.values_mut() {
-            match loader.show() {
+            let shown = loader.show();
+            if let Some((garment, first)) = loader.take_first_cloth() {
+                self.shared.update(|status| status.first_cloth = Some(first));
+                self.shared.add_stage(&garment, loader.stage());
+            }
+            match shown {
                 Ok(false) => {}
                 Ok(true) => {
                     any_new = true;

@@ -59,6 +59,37 @@ fn a_version_is_shown_when_its_initial_graph_is_here_and_the_rest_comes_after() 
 }
 
 #[test]
+fn first_cloth_comes_with_the_leading_columns_its_error_stated() {
+    let (garment, chunks) = tiny::published_in_parts(tiny::initial_links());
+    let mut loader = loader();
+    loader.handle_version(VersionNumber(1), &garment).unwrap();
+    let rest = garment.generations[1].chunk;
+    assert_eq!(wants(&mut loader)[&rest.hash].1, Need::Urgent, "after the leading columns");
+    assert_eq!(feed(&mut loader, &chunks, Need::Version), Ok(0), "no whole version yet");
+    let (name, first) = loader.take_first_cloth().unwrap();
+    assert_eq!((name.as_str(), first.columns, first.all_columns), ("speck", 1, 2));
+    assert_eq!(first.basis_bytes, u64::from(garment.generations[0].chunk.bytes));
+    assert!((first.error_m - tiny::LEADING_ERROR_M).abs() < 2e-4, "{first:?}");
+    assert_eq!(loader.take_first_cloth(), None);
+    let mut character = Character::enter(loader.stage()).unwrap();
+    let StepOutcome::Substituted { error_m } = character.step(PoseId(1)) else {
+        panic!("leading columns are no exact cloth");
+    };
+    assert_eq!(error_m.to_bits(), first.error_m.to_bits());
+    assert!(character.shown_error_m() >= error_m);
+    let near = |a: f32, b: f32| (a - b).abs() < 1e-4;
+    assert!(near(character.sample(1.0)[0], tiny::fractions(1)[0]));
+    // The rest comes: what it adds fades in, and the step is exact.
+    assert_eq!(feed(&mut loader, &chunks, Need::Idle), Ok(1));
+    assert_eq!(character.step(PoseId(0)), StepOutcome::Exact);
+    assert_eq!(character.version().columns_to_come(), 0);
+    let (shown, whole, missing) =
+        (character.sample(1.0)[1], tiny::fractions(3)[1], tiny::fractions(1)[1]);
+    assert!(near(shown, whole - 0.9 * missing), "{shown}");
+    assert_eq!((character.stats().switches, character.stats().missed), (0, 0));
+}
+
+#[test]
 fn a_new_version_fetches_only_what_changed() {
     let (old, mut chunks) = tiny::published(tiny::initial_links());
     let (new, more) = tiny::published(tiny::grown_links());

@@ -7,8 +7,10 @@ use crate::entropy::{self, Bit, Integers, Reader, SCALE_ONE, Writer};
 use crate::kim2013::FULL_SCALE;
 use crate::{COLUMNS_MAX, REGION_STATES_MAX};
 
-const VERSION: u16 = 1;
-const HEADER_BYTES: usize = 18;
+const VERSION: u16 = 2;
+/// The header of version 1, which lacks the error of the leading columns.
+const HEADER_BYTES_1: usize = 18;
+const HEADER_BYTES: usize = 20;
 /// Columns of the tiers: the 16, 32, 64, 128 that carry most in the region at hand.
 pub const TIERS: [usize; 4] = [16, 32, 64, 128];
 /// Unit of the errors of tiers (m): an eighth of a millimetre and less.
@@ -32,7 +34,7 @@ pub enum RegionError {
         actual: usize,
     },
     /// A version that this build does not know.
-    #[error("toile region of version {0}; this build reads version {VERSION}")]
+    #[error("toile region of version {0}; this build reads versions 1 and {VERSION}")]
     Version(u16),
     /// Outside the limits, or more columns than the basis has.
     #[error(
@@ -81,6 +83,8 @@ pub struct RegionParts<'a> {
     pub fixes: &'a [Fix],
     /// Largest vertex error (m) with the [`TIERS`] columns that carry most, fixes left out.
     pub tier_errors_m: [f32; TIERS.len()],
+    /// Largest vertex error (m) with the columns of the garment's first generation alone.
+    pub leading_error_m: f32,
 }
 
 /// A decoded region.
@@ -94,6 +98,7 @@ pub struct Region {
     fix_step_m: f32,
     fixes: Vec<Fix>,
     tier_errors_m: [f32; TIERS.len()],
+    leading_error_m: Option<f32>,
 }
 
 impl Region {
@@ -142,6 +147,12 @@ impl Region {
     /// left out; rounded up.
     pub fn tier_errors_m(&self) -> [f32; TIERS.len()] {
         self.tier_errors_m
+    }
+
+    /// Largest vertex error (m) with the columns of the garment's first generation alone, fixes
+    /// left out; rounded up. `None` in regions of version 1, and where it is 8 m and more.
+    pub fn leading_error_m(&self) -> Option<f32> {
+        self.leading_error_m
     }
 
     /// Adds a state's fixes to its positions (m).
@@ -210,7 +221,7 @@ pub fn encode_region(
     out.push(parts.step);
     out.push(parts.fix_step);
     out.push(u8::from(!parts.fixes.is_empty()));
-    for error_m in parts.tier_errors_m {
+    for error_m in parts.tier_errors_m.into_iter().chain([parts.leading_error_m]) {
         let code = (error_m / TIER_UNIT_M).ceil().clamp(0.0, f32::from(u16::MAX)) as u16;
         out.extend_from_slice(&code.to_le_bytes());
     }
@@ -225,19 +236,24 @@ pub fn encode_region(
 /// Bytes that are no region of this version and basis.
 pub fn parse_region(bytes: &[u8], model: &Model) -> Result<Region, RegionError> {
     let length = RegionError::Length { actual: bytes.len() };
-    let (header, payload) = bytes.split_first_chunk::<HEADER_BYTES>().ok_or(length)?;
+    let version = bytes.first_chunk::<2>().map(|b| u16::from_le_bytes(*b)).ok_or(length)?;
+    let header_bytes = match version {
+        1 => HEADER_BYTES_1,
+        VERSION => HEADER_BYTES,
+        _ => return Err(RegionError::Version(version)),
+    };
+    let (header, payload) = bytes.split_at_checked(header_bytes).ok_or(length)?;
     let number = |at: usize| u16::from_le_bytes([header[at], header[at + 1]]);
-    if number(0) != VERSION {
-        return Err(RegionError::Version(number(0)));
-    }
     let (columns, states) = (usize::from(number(2)), usize::from(header[4]));
     check_shape(states, columns, COLUMNS_MAX)?;
-    if number(16) != payload.len() as u16 || header[7] > 1 {
+    if number(header_bytes - 2) != payload.len() as u16 || header[7] > 1 {
         return Err(length);
     }
     let step = header[5];
     let tier = |i: usize| f32::from(number(8 + 2 * i)) * TIER_UNIT_M;
     let tier_errors_m = [tier(0), tier(1), tier(2), tier(3)];
+    let stated = version > 1 && number(16) < u16::MAX;
+    let leading_error_m = stated.then(|| tier(4));
     let mut reader = Reader::new(payload);
     let mut integers = Integers::new();
     let mut flags = Flags::new();
@@ -271,7 +287,17 @@ pub fn parse_region(bytes: &[u8], model: &Model) -> Result<Region, RegionError> 
     let by_energy = energies.into_iter().map(|(_, column)| column).collect();
     let fix_step_m = step_m(header[6]);
     let columns = known;
-    Ok(Region { states, columns, whole, coefficients, by_energy, fix_step_m, fixes, tier_errors_m })
+    Ok(Region {
+        states,
+        columns,
+        whole,
+        coefficients,
+        by_energy,
+        fix_step_m,
+        fixes,
+        tier_errors_m,
+        leading_error_m,
+    })
 }
 
 /// Fractions of full scale (in steps of 1/32,767) of one step of a column's coefficient.

@@ -12,7 +12,7 @@ fn clock() -> f64 {
 /// Encodes states of `vertices` in regions of 20 and checks both bounds on what is decoded.
 fn kept(states: Vec<f32>, vertices: usize, bound: Bound) -> Measured {
     let source = Source::from_memory(states, vertices, 20);
-    let bench = Bench::new(&source, &clock).unwrap();
+    let bench = Bench::new(&source, &clock, &|_| {}).unwrap();
     let measured = bench.toile("toile", bound).unwrap();
     if let Some(max_m) = bound.max_m {
         assert!(measured.max_m <= f64::from(max_m), "{bound:?}: {measured:?}");
@@ -77,12 +77,12 @@ fn still_states_one_state_and_one_vertex_are_kept() {
 fn what_is_not_finite_or_no_bound_is_refused() {
     let mut states = wave(10, 30);
     let source = Source::from_memory(states.clone(), 10, 20);
-    let bench = Bench::new(&source, &clock).unwrap();
+    let bench = Bench::new(&source, &clock, &|_| {}).unwrap();
     let refused = bench.toile("x", Bound { max_m: Some(0.0), rms_m: None });
     assert!(refused.unwrap_err().to_string().contains("0.01 mm"));
     states[77] = f32::NAN;
     let source = Source::from_memory(states, 10, 20);
-    let Err(BenchError::Encode(error)) = Bench::new(&source, &clock) else {
+    let Err(BenchError::Encode(error)) = Bench::new(&source, &clock, &|_| {}) else {
         panic!("not a number, and taken");
     };
     assert!(error.to_string().contains("state 2"), "{error}");

@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use codec::kernel::Select;
 use codec::kim2013::FULL_SCALE;
 use codec::toile::{self, Fix, Model, Region, RegionParts, TIERS};
 
@@ -21,6 +22,7 @@ impl Bounded {
             self.model = Model::new(tree.vertices());
             self.made = (generation.states(), generation.rms_m());
             self.first_generations = 0;
+            self.leading = generation.columns().len();
         }
         // Generations of one moment were made from equally many states, and follow each other.
         let of_first =
@@ -57,13 +59,15 @@ pub(super) fn region(
         fix_step: 0,
         fixes: &[],
         tier_errors_m: [0.0; TIERS.len()],
+        leading_error_m: 0.0,
     };
     let mut bytes = Vec::new();
     toile::encode_region(&bounded.model, &parts, &mut bytes)?;
     let plain = toile::parse_region(&bytes, &bounded.model)?;
     let mut decoded = Vec::new();
-    encoder.reconstruct(plain.coefficients(), &mut decoded);
+    encoder.reconstruct(plain.coefficients(), Select::First(columns), &mut decoded);
     parts.tier_errors_m = tier_errors(encoder, &plain, positions, &decoded);
+    parts.leading_error_m = leading_error(encoder, &plain, bounded.leading, positions);
     let fixes = match bounded.max_m {
         Some(max_m) => {
             parts.fix_step = fix_step(max_m);
@@ -105,7 +109,7 @@ pub(super) fn decode_columns(
     };
     let coefficients: Vec<i16> =
         region.coefficients().chunks_exact(known).flat_map(widened).collect();
-    encoder.reconstruct(&coefficients, out);
+    encoder.reconstruct(&coefficients, Select::First(columns), out);
     region
 }
 
@@ -131,6 +135,14 @@ fn fixes(exact: &[f32], decoded: &[f32], rows: usize, max_m: f32, step: u8) -> V
     fixes
 }
 
+/// Largest vertex error (m) with the first generation's columns alone.
+fn leading_error(encoder: &Encoder, region: &Region, leading: usize, exact: &[f32]) -> f32 {
+    let mut decoded = Vec::new();
+    let select = Select::First(leading.min(region.columns()));
+    encoder.reconstruct(region.coefficients(), select, &mut decoded);
+    errors(exact, &decoded).0
+}
+
 /// Largest vertex error (m) with the columns of each tier alone.
 fn tier_errors(
     encoder: &Encoder,
@@ -138,21 +150,15 @@ fn tier_errors(
     exact: &[f32],
     whole: &[f32],
 ) -> [f32; TIERS.len()] {
-    let columns = region.columns();
     let mut decoded = Vec::new();
     let mut of_whole = None;
     TIERS.map(|count| {
         if count >= region.by_energy().len() {
             return *of_whole.get_or_insert_with(|| errors(exact, whole).0);
         }
-        let mut kept = vec![0i16; region.coefficients().len()];
-        for column in region.by_energy()[..count].iter().map(|c| usize::from(*c)) {
-            for state in 0..region.states() {
-                let at = state * columns + column;
-                kept[at] = region.coefficients()[at];
-            }
-        }
-        encoder.reconstruct(&kept, &mut decoded);
+        let mut active = region.by_energy()[..count].to_vec();
+        active.sort_unstable();
+        encoder.reconstruct(region.coefficients(), Select::Only(&active), &mut decoded);
         errors(exact, &decoded).0
     })
 }

@@ -7,6 +7,7 @@ use super::basis::{Columns, StreamingSvd};
 use super::design::{BOUND_M_MIN, Design, Spectrum};
 use super::encode::{EncodeError, EncodeSettings, Profile, Visit};
 use super::statistics::Statistics;
+use super::wide::wide_columns;
 use super::{fixed_bits, order};
 
 /// Largest entry that is aimed at: room is left for what prediction rounds up.
@@ -27,7 +28,21 @@ impl Analysis {
     ) -> Result<Self, EncodeError> {
         let mut svd = StreamingSvd::new(rows, rank);
         visit(&mut |region| Ok(region.chunks_exact(rows).try_for_each(|s| svd.push(s))?))?;
-        let Columns { columns, .. } = svd.finish()?;
+        Self::of(rows, svd.finish()?, visit)
+    }
+
+    /// The same for many columns; `visit` is called five times.
+    pub(super) fn wide(
+        rows: usize,
+        rank: usize,
+        visit: &mut Visit<'_>,
+    ) -> Result<Self, EncodeError> {
+        let columns = wide_columns(rows, rank, visit)?;
+        Self::of(rows, columns, visit)
+    }
+
+    fn of(rows: usize, columns: Columns, visit: &mut Visit<'_>) -> Result<Self, EncodeError> {
+        let Columns { columns, .. } = columns;
         let mut statistics = Statistics::new(columns.ncols());
         visit(&mut |region| {
             let states = region.len() / rows;

@@ -4,6 +4,7 @@
 
 use std::sync::Arc;
 
+use codec::kernel::Select;
 use codec::kim2013::{self, FULL_SCALE};
 use codec::toile::{self, Model, Tree};
 use codec::{AppendError, Basis};
@@ -198,12 +199,14 @@ pub(super) struct Bounded {
     /// How many generations are of that moment.
     pub(super) first_generations: usize,
     pub(super) generations: usize,
+    /// Columns of the first generation.
+    pub(super) leading: usize,
     pub(super) max_m: Option<f32>,
 }
 
 /// One generation: `C' -> metres`, and the factor of its normal equations.
 struct Layer {
-    columns: Mat<f64>,
+    columns: Mat<f32>,
     normal: Llt<f64>,
 }
 
@@ -224,6 +227,7 @@ impl Encoder {
                 made: (0, 0.0),
                 first_generations: 0,
                 generations: 0,
+                leading: 0,
                 max_m: settings.bound.max_m,
             })),
         };
@@ -300,18 +304,35 @@ impl Encoder {
         }
     }
 
-    /// Positions (m) from coefficients in 16-bit steps of full scale, state after state; `out` is
-    /// resized.
-    pub(super) fn reconstruct(&self, coefficients: &[i16], out: &mut Vec<f32>) {
+    /// A region's coefficients in fractions of full scale, state after state, as many as the basis
+    /// has columns; and its columns that are not zero, those that carry most first.
+    pub(super) fn coefficients(&self, region: &[u8]) -> (Vec<f32>, Vec<u16>) {
+        let columns = self.basis.columns();
+        match &self.coding {
+            Coding::Kim2013 => {
+                let region = kim2013::Region::parse(region).expect("a region of this encoder");
+                let full = region.coefficients().map(|c| f32::from(c) * (1.0 / FULL_SCALE));
+                (full.collect(), (0..columns as u16).collect())
+            }
+            Coding::Toile(bounded) => {
+                let region = toile::parse_region(region, &bounded.model);
+                let region = region.expect("a region of this encoder");
+                let full = region.coefficients().iter().map(|c| f32::from(*c) / FULL_SCALE);
+                (full.collect(), region.by_energy().to_vec())
+            }
+        }
+    }
+
+    /// Positions (m) from coefficients in 16-bit steps of full scale, state after state, with these
+    /// columns; `out` is resized.
+    pub(super) fn reconstruct(&self, coefficients: &[i16], select: Select<'_>, out: &mut Vec<f32>) {
         let (rows, columns) = (self.basis.rows(), self.basis.columns());
         out.resize(coefficients.len() / columns * rows, 0.0);
-        let mut scaled = vec![0.0f32; columns];
-        for (state, out) in coefficients.chunks_exact(columns).zip(out.chunks_exact_mut(rows)) {
-            let scale = |(out, c): (&mut f32, &i16)| *out = f32::from(*c) * (1.0 / FULL_SCALE);
-            scaled.iter_mut().zip(state).for_each(scale);
-            let whole = self.basis.reconstruct(&scaled, 0..rows, columns, out);
-            whole.expect("lengths are those of the basis");
-        }
+        let scaled: Vec<f32> =
+            coefficients.iter().map(|c| f32::from(*c) * (1.0 / FULL_SCALE)).collect();
+        // All states in one pass over the columns: each comes out as it does alone.
+        let whole = self.basis.reconstruct_batch(&scaled, columns, 0..rows, select, out);
+        whole.expect("lengths are those of the basis");
     }
 
     /// Fits states to the columns. `round` gets column, state and the coefficient in fractions of
@@ -324,11 +345,14 @@ impl Encoder {
     ) -> bool {
         let rows = self.basis.rows();
         let states = positions.len() / rows;
-        let mut rest = Mat::from_fn(rows, states, |row, s| f64::from(positions[s * rows + row]));
+        let mut rest = Mat::from_fn(rows, states, |row, s| positions[s * rows + row]);
         let mut overflowed = false;
         let mut first = 0;
         for (index, layer) in self.layers.iter().enumerate() {
-            let mut coefficients = layer.columns.transpose() * &rest;
+            // Products in f32: what they round away is micrometres, where a step is millimetres.
+            let products = layer.columns.transpose() * &rest;
+            let mut coefficients =
+                Mat::from_fn(products.nrows(), states, |c, s| f64::from(products[(c, s)]));
             layer.normal.solve_in_place(coefficients.as_mut());
             for state in 0..states {
                 let column = coefficients.col_as_slice_mut(state);
@@ -339,7 +363,9 @@ impl Encoder {
                 }
             }
             if index + 1 < self.layers.len() {
-                rest -= &layer.columns * &coefficients;
+                let rounded =
+                    Mat::from_fn(products.nrows(), states, |c, s| coefficients[(c, s)] as f32);
+                rest -= &layer.columns * &rounded;
             }
             first += layer.columns.ncols();
         }
@@ -350,24 +376,25 @@ impl Encoder {
 impl Layer {
     /// `None` where the columns depend on one another.
     fn new(generation: &kim2013::Generation<'_>) -> Option<Self> {
-        let mut columns = Mat::zeros(generation.rows(), generation.columns());
+        let mut exact = Mat::zeros(generation.rows(), generation.columns());
         let step = f64::from(generation.step_m());
         for (c, (width, bytes)) in generation.entries().enumerate() {
             let entry = |b: &[u8]| match width {
                 kim2013::Width::Bits8 => i16::from(b[0] as i8),
                 kim2013::Width::Bits16 => i16::from_le_bytes([b[0], b[1]]),
             };
-            let out = columns.col_as_slice_mut(c).iter_mut();
+            let out = exact.col_as_slice_mut(c).iter_mut();
             out.zip(bytes.chunks_exact(width.bytes()))
                 .for_each(|(out, b)| *out = step * f64::from(entry(b)));
         }
-        let mut gram = columns.transpose() * &columns;
+        let mut gram = exact.transpose() * &exact;
         for c in 0..gram.ncols() {
             // Quantised columns may all but depend on one another, or be nothing at all.
             let square = gram[(c, c)];
             gram[(c, c)] = if square > 0.0 { square * (1.0 + 1e-9) } else { 1.0 };
         }
         let normal = gram.llt(Side::Lower).ok()?;
+        let columns = Mat::from_fn(exact.nrows(), exact.ncols(), |r, c| exact[(r, c)] as f32);
         Some(Self { columns, normal })
     }
 }

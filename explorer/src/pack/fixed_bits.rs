@@ -1,5 +1,6 @@
 //! Regions and generations of profile `kim2013`.
 
+use codec::kernel::Select;
 use codec::kim2013::{self, FULL_SCALE, Region};
 use faer::MatRef;
 
@@ -25,14 +26,8 @@ pub(super) fn region(encoder: &Encoder, positions: &[f32]) -> EncodedRegion {
 /// Positions (m) of all states.
 pub(super) fn decode(encoder: &Encoder, region: &[u8], out: &mut Vec<f32>) {
     let region = Region::parse(region).expect("a region of this encoder");
-    let (rows, columns) = (encoder.basis.rows(), encoder.basis.columns());
-    let mut coefficients = vec![0.0; columns];
-    out.resize(region.states() * rows, 0.0);
-    for (state, out) in out.chunks_exact_mut(rows).enumerate() {
-        region.state(state, &mut coefficients);
-        let whole = encoder.basis.reconstruct(&coefficients, 0..rows, columns, out);
-        whole.expect("lengths are those of the basis");
-    }
+    let coefficients: Vec<i16> = region.coefficients().collect();
+    encoder.reconstruct(&coefficients, Select::First(encoder.basis.columns()), out);
 }
 
 /// A generation of orthonormal columns whose coefficients reach `maxima_m`: those alone that move

@@ -23,6 +23,7 @@ mod regions;
 pub mod scene_chunk;
 mod statistics;
 pub mod store;
+mod wide;
 
 pub use design::Bound;
 pub use encode::{EncodeSettings, Profile};

@@ -310,17 +310,11 @@ impl Publisher {
         })
     }
 
-    /// Whether a new basis pays, though every state is sent again on it: the states have doubled
-    /// since the basis was made, and they have outgrown it. Doubling bounds the price: all bases
-    /// together cost no more than twice the last one.
+    /// Whether a new basis pays for the head's garment.
     fn pays_to_rebase(&self, states: u64) -> bool {
-        let (Coding::Toile(bounded), Some(garment)) = (&self.encoder.coding, self.garment()) else {
-            return false;
-        };
-        let (made_states, rms_m) = bounded.made;
-        let outgrown = garment.generations.len() > bounded.first_generations
-            || garment.stats.codec_rms_error_m > 1.1 * rms_m;
-        states >= 2 * u64::from(made_states).max(1) && outgrown
+        let Some(garment) = self.garment() else { return false };
+        let rms_m = garment.stats.codec_rms_error_m;
+        pays_to_rebase(&self.encoder, garment.generations.len(), states, rms_m)
     }
 
     /// The link pages, proved total.
@@ -468,6 +462,21 @@ impl Fixed {
         };
         Err(PublishError::OtherScene { garment: self.name.clone(), what })
     }
+}
+
+/// Whether a new basis pays, though every state is sent again on it: the states have doubled
+/// since the basis was made, and they have outgrown it. Doubling bounds the price: all bases
+/// together cost no more than twice the last one.
+pub(super) fn pays_to_rebase(
+    encoder: &Encoder,
+    generations: usize,
+    states: u64,
+    codec_rms_m: f32,
+) -> bool {
+    let Coding::Toile(bounded) = &encoder.coding else { return false };
+    let (made_states, rms_m) = bounded.made;
+    let outgrown = generations > bounded.first_generations || codec_rms_m > 1.1 * rms_m;
+    states >= 2 * u64::from(made_states).max(1) && outgrown
 }
 
 /// The profile in which a store holds a garment, if it does.

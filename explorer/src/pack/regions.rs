@@ -25,8 +25,8 @@ const _: () = assert!(codec::ROWS_MAX == 3 * limits::VERTICES_MAX);
 pub(super) struct Cut {
     pub(super) first: StateId,
     pub(super) count: u32,
-    job: u64,
-    initial: bool,
+    pub(super) job: u64,
+    pub(super) initial: bool,
 }
 
 /// Runs that cannot be what a graph holds.
