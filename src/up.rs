@@ -75,10 +75,11 @@ pub fn run(a: &args::Up) -> Result<()> {
         ..ExploreOptions::default()
     };
     let named = Named::new(&a.scene, None);
+    let bare = view::Bare::new(&scene);
     let explorer = Explorer::start((scene, named), opened, work, options)?;
     let players = players(&server, a.players)?;
     let server_page = server.http_addr().map(|http| format!("http://{http}/"));
-    let view = View::start(client(&server), Some(tag_token), a.page, server_page)?;
+    let view = View::start(client(&server), Some(tag_token), a.page, server_page, bare)?;
     if !a.json {
         println!("{}", view.url());
     }

@@ -8,6 +8,7 @@ use anyhow::{Context, Result, bail};
 use client_lib::{Client, ClientConfig, GarmentId, TagOutcome, VersionNumber};
 use serde::Serialize;
 
+use super::stand_in::Bare;
 use super::survey::{Loop, Survey};
 
 /// Pages at the same time.
@@ -32,6 +33,7 @@ pub struct App {
     may_tag: bool,
     pages: AtomicU64,
     exploring: Mutex<String>,
+    bare: Option<Arc<Bare>>,
     older: Mutex<Vec<(u64, Weak<Client>)>>,
     tags: Mutex<Vec<Tag>>,
 }
@@ -55,7 +57,8 @@ pub struct Tag {
 }
 
 impl App {
-    /// Pages on a connection. `may_tag`: whether its token has that right.
+    /// Pages on a connection. `may_tag`: whether its token has that right; `bare`: what walks
+    /// until there is a version.
     ///
     /// # Errors
     /// The connection's settings cannot be used.
@@ -63,6 +66,7 @@ impl App {
         connection: ClientConfig,
         server_page: Option<String>,
         may_tag: bool,
+        bare: Option<Bare>,
     ) -> Result<Self> {
         Ok(Self {
             client: Client::connect(connection.clone())?,
@@ -71,6 +75,7 @@ impl App {
             may_tag,
             pages: AtomicU64::new(0),
             exploring: Mutex::default(),
+            bare: bare.map(Arc::new),
             older: Mutex::default(),
             tags: Mutex::default(),
         })
@@ -84,6 +89,11 @@ impl App {
     /// Whether merges can be tagged.
     pub fn may_tag(&self) -> bool {
         self.may_tag
+    }
+
+    /// The scene, where it is explored in this process.
+    pub fn bare(&self) -> Option<&Arc<Bare>> {
+        self.bare.as_ref()
     }
 
     /// What the explorer in this process last said, for pages that wait.

@@ -11,7 +11,9 @@ mod http;
 mod session;
 mod show;
 mod skinned;
+mod stand_in;
 mod steering;
+mod stills;
 mod survey;
 mod wire;
 
@@ -28,6 +30,7 @@ use tokio::sync::watch;
 use crate::explore::Stop;
 use crate::{args, place, store};
 use app::App;
+pub use stand_in::Bare;
 
 /// Between two looks at whether to stop.
 const POLL: Duration = Duration::from_millis(100);
@@ -45,7 +48,7 @@ pub struct View {
 
 impl View {
     /// Connects to a server and serves the page at `listen`. With a token for tags the page may set
-    /// some.
+    /// some; until there is a version, `bare` walks on it.
     ///
     /// # Errors
     /// An address that is not this machine's own, or is taken; a fingerprint that cannot be read.
@@ -54,6 +57,7 @@ impl View {
         tag_token: Option<String>,
         listen: SocketAddr,
         server_page: Option<String>,
+        bare: Option<Bare>,
     ) -> Result<Self> {
         ensure!(
             listen.ip().is_loopback(),
@@ -71,7 +75,7 @@ impl View {
         let address = listener.local_addr()?;
         let may_tag = tag_token.is_some();
         let token = tag_token.or(client.token.clone());
-        let app = App::new(ClientConfig { token, ..client }, server_page, may_tag)?;
+        let app = App::new(ClientConfig { token, ..client }, server_page, may_tag, bare)?;
         let app = Arc::new(app);
         let (stop, mut stopped) = watch::channel(false);
         let stops = async move { drop(stopped.wait_for(|stop| *stop).await) };
@@ -120,7 +124,7 @@ pub fn run(a: &args::View) -> Result<()> {
         (None, None) => anyhow::bail!("name a server (--connect ADDRESS) or a store to show"),
     };
     let server_page = serving.as_ref().and_then(Serving::page);
-    let view = View::start(config, tag_token, a.listen, server_page)?;
+    let view = View::start(config, tag_token, a.listen, server_page, None)?;
     println!("{}", view.url());
     let mut pages = 0;
     while !stop.is_asked() {

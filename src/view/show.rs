@@ -9,11 +9,13 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::actor::{Actor, Blending, Still, Tint};
+use super::actor::{Actor, Blending, Still};
 use super::answers;
 use super::app::App;
 use super::dial;
+use super::stand_in::StandIn;
 use super::steering::Steering;
+use super::stills::fill_stills;
 use super::survey::{Loop, Survey, clip_name};
 use super::wire::{self, FrameWriter};
 
@@ -105,6 +107,8 @@ pub struct Show {
     mode: Mode,
     actors: Vec<Actor>,
     steering: Option<Steering>,
+    /// Who walks while there is no cloth yet.
+    stand_in: Option<StandIn>,
     survey: Option<Survey>,
     /// Connections of panes that play older versions.
     older: Vec<Arc<Client>>,
@@ -166,6 +170,7 @@ impl Show {
             mode: Mode::Play,
             actors: Vec::new(),
             steering: None,
+            stand_in: None,
             survey: None,
             older: Vec::new(),
             fixed_columns: Vec::new(),
@@ -185,16 +190,12 @@ impl Show {
     pub fn frame(&mut self) -> Result<Vec<Said>> {
         let mut said = Vec::new();
         if self.actors.is_empty() && !self.enter()? {
-            let status = self.app.client.status();
-            said.push(Said::Text(json!({
-                "say": "waiting", "connected": status.connected, "error": status.error,
-                "exploring": self.app.exploring(),
-            })));
+            self.wait(&mut said);
             return Ok(said);
         }
         self.advance()?;
         self.take_version(&mut said)?;
-        let phase = self.clock.ticks.fract() as f32;
+        let phase = self.clock.phase();
         self.writer.begin();
         for actor in &mut self.actors {
             let start = Instant::now();
@@ -237,13 +238,45 @@ impl Show {
         Ok(None)
     }
 
+    /// What is awaited, in words; meanwhile the character walks in plain skinning, where its scene is known.
+    fn wait(&mut self, said: &mut Vec<Said>) {
+        let bare = self.app.bare();
+        if self.figures.reported.is_none_or(|at| at.elapsed() >= REPORT) || bare.is_none() {
+            let status = self.app.client.status();
+            self.figures.reported = Some(Instant::now());
+            said.push(Said::Text(json!({
+                "say": "waiting", "connected": status.connected, "error": status.error,
+                "exploring": self.app.exploring(),
+                "clips": bare.map_or(&[][..], |bare| bare.scene.clips()),
+            })));
+        }
+        let Some(bare) = bare else { return };
+        if self.stand_in.is_none() {
+            said.push(Said::Bytes(bare.meshes()));
+            self.steering = Some(Steering::new(&bare.scene, self.figures.seed));
+            self.clock.last = Instant::now();
+        }
+        let stand_in = self.stand_in.get_or_insert_with(|| StandIn::new(bare));
+        for _ in 0..self.clock.due(bare.scene.fps()) {
+            let next = self.steering.as_mut().map(|steering| steering.next(stand_in.pose()));
+            stand_in.step(next.unwrap_or(stand_in.pose()));
+        }
+        self.writer.begin();
+        stand_in.write(self.clock.phase(), &mut self.writer);
+        said.push(Said::Bytes(self.writer.end()));
+    }
+
     /// Takes the stage as soon as there is a version.
     fn enter(&mut self) -> Result<bool> {
         let Ok(character) = self.app.client.character(self.app.garment()) else {
             return Ok(false);
         };
         let scene = Arc::clone(character.version().scene());
-        self.steering = Some(Steering::new(&scene, self.figures.seed));
+        let goal = self.steering.as_ref().and_then(Steering::goal);
+        let mut steering = Steering::new(&scene, self.figures.seed);
+        steering.head_for(goal);
+        self.steering = Some(steering);
+        self.stand_in = None;
         self.actors = vec![Actor::new(character, 0)];
         self.fixed_columns = vec![None];
         self.clock.last = Instant::now();
@@ -253,12 +286,8 @@ impl Show {
     /// Plays as many ticks of the scene as the clock says.
     fn advance(&mut self) -> Result<()> {
         let Some(lead) = self.actors.first() else { return Ok(()) };
-        let fps = f64::from(lead.character.version().scene().fps());
-        let passed = self.clock.last.elapsed().min(LATE_MAX);
-        self.clock.last = Instant::now();
-        self.clock.ticks += passed.as_secs_f64() * fps * self.clock.speed;
-        while self.clock.played < self.clock.ticks.ceil() as u64 {
-            self.clock.played += 1;
+        let fps = lead.character.version().scene().fps();
+        for _ in 0..self.clock.due(fps) {
             self.tick();
         }
         Ok(())
@@ -268,7 +297,7 @@ impl Show {
         let Some(steering) = &mut self.steering else { return };
         match &mut self.mode {
             Mode::Play | Mode::Compare(_) => {
-                let next = steering.next(&self.actors[0].character);
+                let next = steering.next(self.actors[0].character.pose());
                 for (index, actor) in self.actors.iter_mut().enumerate() {
                     let outcome = actor.character.step(next);
                     if index == 0 {
@@ -278,7 +307,7 @@ impl Show {
             }
             Mode::Crowd(walks) => {
                 for (actor, walk) in self.actors.iter_mut().zip(walks) {
-                    let next = walk.next(&actor.character);
+                    let next = walk.next(actor.character.pose());
                     let outcome = actor.character.step(next);
                     self.figures.count(outcome, &actor.character, self.clock.played);
                 }
@@ -499,6 +528,23 @@ impl Show {
     }
 }
 
+impl Clock {
+    /// Ticks of the scene that are to be played by now.
+    fn due(&mut self, fps: f32) -> u64 {
+        let passed = self.last.elapsed().min(LATE_MAX);
+        self.last = Instant::now();
+        self.ticks += passed.as_secs_f64() * f64::from(fps) * self.speed;
+        let due = (self.ticks.ceil() as u64).saturating_sub(self.played);
+        self.played += due;
+        due
+    }
+
+    /// How far the time is between the last tick and the next.
+    fn phase(&self) -> f32 {
+        self.ticks.fract() as f32
+    }
+}
+
 impl Figures {
     fn count(&mut self, outcome: StepOutcome, character: &Character, frame: u64) {
         let kind = match outcome {
@@ -518,40 +564,4 @@ impl Figures {
             });
         }
     }
-}
-
-/// Reads what stills show once it has been streamed, and colours the cloth by their distance.
-fn fill_stills(actors: &mut [Actor]) {
-    let [walker, before, after] = actors else { return };
-    let waits = |actor: &Actor| actor.still.as_ref().is_some_and(|s| s.positions.is_empty());
-    if !waits(before) && !waits(after) {
-        return;
-    }
-    for actor in [&mut *before, &mut *after] {
-        actor.character.refresh();
-        let Some(still) = &mut actor.still else { continue };
-        if !matches!(actor.character.cloth_of(still.state, &mut still.positions), Ok(true)) {
-            still.positions.clear();
-        }
-    }
-    if waits(before) || waits(after) {
-        return;
-    }
-    let tint = tint(before, after);
-    walker.tint = Tint { weight: 0.0, ..tint.clone() };
-    before.tint = tint.clone();
-    after.tint = tint;
-}
-
-/// Distances between the cloth of two stills, by vertex, as shares of the largest.
-fn tint(a: &Actor, b: &Actor) -> Tint {
-    let (Some(a), Some(b)) = (&a.still, &b.still) else { return Tint::default() };
-    let ((a, _), (b, _)) = (a.positions.as_chunks::<3>(), b.positions.as_chunks::<3>());
-    let apart = a.iter().zip(b).map(|(a, b)| Vec3::from_array(*a).distance(Vec3::from_array(*b)));
-    let distances: Vec<f32> = apart.collect();
-    let largest = distances.iter().copied().fold(0.0f32, f32::max);
-    if largest < 1e-5 {
-        return Tint::default();
-    }
-    Tint { shares: distances.iter().map(|d| d / largest).collect(), weight: 1.0 }
 }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use client_lib::{Character, Histogram, PoseId, Scene, Steer};
+use client_lib::{Histogram, PoseId, Scene, Steer};
 use serde::Serialize;
 
 /// A walk, and how soon it answered.
@@ -76,8 +76,7 @@ impl Steering {
     }
 
     /// The pose after the character's, one frame on.
-    pub fn next(&mut self, character: &Character) -> PoseId {
-        let pose = character.pose();
+    pub fn next(&mut self, pose: PoseId) -> PoseId {
         let to_goal = self.goal.and_then(|goal| self.steer.next(pose, goal));
         let next = to_goal.unwrap_or_else(|| self.anywhere(pose));
         self.measure(next);

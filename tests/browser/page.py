@@ -109,9 +109,18 @@ def drive(checks, a, folder, browser):
             a.pictures.mkdir(parents=True, exist_ok=True)
             page.screenshot(path=a.pictures / f"{name}.png")
 
-    def moves():
+    def waits():
         page.goto(up.url)
-        wait(page, "() => window.toile && toile.measured.drawn > 3", 900)
+        wait(page, "() => window.toile && toile.measured.drawn > 3", 60)
+        seconds = time.monotonic() - up.started
+        assert page.evaluate("toile.measured.versions.length") == 0, "a version so soon"
+        wait(page, "() => /Waiting.*frames/.test(document.getElementById('notice').textContent)", 120)
+        picture("waiting")
+        return {"from_up_to_moving_body_s": round(seconds, 1)}
+
+    def moves():
+        wait(page, "() => toile.measured.versions.length > 0", 900)
+        drawn_on(page, 3)
         seconds = time.monotonic() - up.started
         drawn_on(page, 10)
         picture("now")
@@ -225,7 +234,7 @@ def drive(checks, a, folder, browser):
         assert not errors, errors
 
     for name, check in [
-            ("a robe moves on the page", moves), ("keys steer it", steers),
+            ("the body walks while the robe is simulated", waits), ("a robe moves on the page", moves), ("keys steer it", steers),
             ("a new version announces itself", sees_a_version),
             ("a tagged merge is simulated, and its error falls", tags),
             ("four panes, side by side", compares), ("the dial leaves columns out", dials),

@@ -69,8 +69,7 @@ class Page {
     switch (said.say) {
       case "waiting":
         this.asked = 0;
-        at("notice").textContent = said.connected ? `Waiting for a first version. ${said.exploring}`
-          : `Waiting for the server. ${said.error || ""}`;
+        this.waitFor(said);
         break;
       case "version":
         this.takeVersion(said);
@@ -85,6 +84,13 @@ class Page {
         this.panels.news(said.why);
         break;
     }
+  }
+
+  waitFor(said) {
+    if (said.clips.length > 0 && said.clips.join() !== this.clips.join()) this.makeClips(said.clips);
+    const skinned = said.clips.length > 0 ? "Shown until then: the garment skinned to the body. " : "";
+    at("notice").textContent = said.connected ? `Waiting for the first simulated cloth. ${skinned}${said.exploring}`
+      : `Waiting for the server. ${said.error || ""}`;
   }
 
   takeVersion(said) {
