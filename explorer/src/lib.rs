@@ -28,6 +28,7 @@ pub mod simulator;
 pub mod tags;
 pub mod tailor;
 pub mod telemetry;
+pub mod upsample;
 pub mod view;
 pub mod watchdog;
 

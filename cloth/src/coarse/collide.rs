@@ -26,6 +26,11 @@ impl Capsule {
         Self { ends: [center, center], radius }
     }
 
+    /// The point of its axis that is nearest to `x`, and how far along it lies (0 to 1).
+    pub(crate) fn closest(&self, x: Vec3A) -> (Vec3A, f32) {
+        closest(&self.ends.map(Vec3A::from), x)
+    }
+
     /// Whether no number is NaN or above `far` and the radius is not below 0.
     pub(super) fn is_sound(&self, far: f32) -> bool {
         let near = |e: &Vec3| !e.is_nan() && e.abs().max_element() <= far;

@@ -151,6 +151,11 @@ impl Near {
 }
 
 impl Row {
+    /// In front of the plane through `point`, which moves by `travel` during the substep.
+    pub(crate) fn plane(normal: Vec3A, point: Vec3A, travel: Vec3A, offset: f32) -> Self {
+        Self { kind: Kind::Plane, normal, point, travel, offset }
+    }
+
     /// The ground below `x`.
     pub(crate) fn ground(x: Vec3A, offset: f32) -> Self {
         let point = Vec3A::new(x.x, 0.0, x.z);

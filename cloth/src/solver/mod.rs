@@ -12,6 +12,7 @@ pub(crate) mod membrane;
 pub(crate) mod recover;
 pub(crate) mod self_contact;
 pub(crate) mod simd;
+pub mod track;
 
 use glam::{Mat3A, Vec3, Vec3A};
 
@@ -229,7 +230,7 @@ impl Workspace {
         self.set_guess(model, dt);
         self.carry_rows(model, dt);
         self.assemble(model, dt);
-        self.add_air(model, dt);
+        self.add_air(model, model.environment.wind, dt);
         self.bare.copy_from_slice(&self.matrix.diagonal);
         effort.iterations += self.pass(model, dt, true);
         self.find_rows(model, dt, body_way);
@@ -362,7 +363,7 @@ impl Workspace {
     }
 
     /// Drag on each vertex's share of the sheet, along the sheet's normal.
-    fn add_air(&mut self, model: &Model, dt: f32) {
+    fn add_air(&mut self, model: &Model, wind: Vec3, dt: f32) {
         let factor = 0.5 * model.environment.air_density * model.material.drag;
         if factor <= 0.0 {
             return;
@@ -375,7 +376,7 @@ impl Workspace {
                 self.normals[v] += n;
             }
         }
-        let wind = Vec3A::from(model.environment.wind);
+        let wind = Vec3A::from(wind);
         for (i, area) in model.mesh.vertex_areas().iter().enumerate() {
             let n = self.normals[i].normalize_or_zero();
             let speed = n.dot(self.v[i] - wind);
