@@ -8,6 +8,10 @@ use clap::{Args, Parser, Subcommand};
 use explorer::grow::policy::Policy;
 use explorer::pack::Profile;
 
+mod codec;
+
+pub use codec::{Codec, CodecBench, CodecCommand, CodecContact, DecodeBench};
+
 /// Near-exhaustive precomputed cloth: explore, publish, stream, play.
 #[derive(Debug, Parser)]
 #[command(name = "toile", version, about, max_term_width = 100)]
@@ -418,64 +422,6 @@ pub struct Chart {
     /// What `toile codec bench --json` printed, instead of measuring again.
     #[arg(long, value_name = "FILE.json")]
     pub bench: Option<PathBuf>,
-}
-
-/// `toile codec`.
-#[derive(Debug, Args)]
-pub struct Codec {
-    /// What to measure.
-    #[command(subcommand)]
-    pub command: CodecCommand,
-}
-
-/// The commands of `toile codec`.
-#[derive(Debug, Subcommand)]
-pub enum CodecCommand {
-    /// Time decoding at the papers' dimensions beside the speed of this machine's memory.
-    DecodeBench(DecodeBench),
-    /// Encode the states of an explored store with every codec: bytes, errors, times.
-    Bench(CodecBench),
-}
-
-/// `toile codec bench`.
-#[derive(Debug, Args)]
-pub struct CodecBench {
-    /// Object store: a folder or a URL.
-    #[arg(value_name = "STORE")]
-    pub store: String,
-    /// Work folder that it was explored in, which holds the exact states [default: beside a local
-    /// store].
-    #[arg(long, value_name = "DIR")]
-    pub work: Option<PathBuf>,
-    /// Also a codec that keeps every vertex within this distance (mm).
-    #[arg(long, value_name = "MM", allow_negative_numbers = true)]
-    pub bound_mm: Option<f32>,
-    /// At most so many states, whole regions spread evenly [default: all].
-    #[arg(long)]
-    pub states: Option<usize>,
-    /// Rows that have not begun after so many minutes are left out, and named.
-    #[arg(long, value_name = "MINUTES", default_value_t = 60)]
-    pub minutes: u32,
-    /// Instead: grow a graph in ten appended versions, and make a new basis at the end.
-    #[arg(long)]
-    pub generations: bool,
-    /// Also write the exact states, and the rounded coefficients, for other programs to code.
-    #[arg(long, value_name = "DIR")]
-    pub export: Option<PathBuf>,
-    /// One JSON object on the last line of stdout.
-    #[arg(long)]
-    pub json: bool,
-}
-
-/// `toile codec decode-bench`.
-#[derive(Debug, Args)]
-pub struct DecodeBench {
-    /// Other memory read between cold frames, and for the read bandwidth (MiB).
-    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u32).range(256..=65536))]
-    pub other_mb: u32,
-    /// One JSON object on the last line of stdout.
-    #[arg(long)]
-    pub json: bool,
 }
 
 /// `toile lab`.

@@ -9,6 +9,12 @@ use serde_json::Value;
 
 use crate::{args, codec};
 
+/// Where no bytes at all are drawn on a logarithmic axis,
+const LEAST_BYTES: f64 = 1.0;
+/// and no error at all (mm).
+const LEAST_MM: f64 = 0.1;
+/// The dear end: exact, without a byte, at a price in time.
+const SIMULATION: &str = "full-simulation";
 /// Pixels to a unit of the PNG files.
 const SCALE: u32 = 2;
 
@@ -55,18 +61,15 @@ pub fn run(a: &args::Chart) -> Result<()> {
     let file = |name: &str| a.out.join(name);
     std::fs::write(file("codecs.csv"), csv(&measured)).context("writing codecs.csv")?;
     type Axis = fn(&Point) -> f64;
-    // Codecs differ by factors of hundreds: equal factors take equal room.
-    let bytes: Axis = |p| p.bytes.log10();
-    let share: Axis = |p| p.total_bytes.log10();
-    let time: Axis = |p| p.decode_ms.log10();
+    let bytes: Axis = |p| p.bytes.max(LEAST_BYTES);
+    let share: Axis = |p| p.total_bytes.max(LEAST_BYTES);
+    let time: Axis = |p| p.decode_ms;
     let charts = [
-        ("bytes-rms", "log10 of bytes per frame", bytes, "rms error (mm)", (|p| p.rms_mm) as Axis),
-        ("bytes-max", "log10 of bytes per frame", bytes, "largest error (mm)", |p| p.max_mm),
-        ("total-rms", "log10 of bytes per frame, basis included", share, "rms error (mm)", |p| {
-            p.rms_mm
-        }),
-        ("time-rms", "log10 of ms per frame", time, "rms error (mm)", |p| p.rms_mm),
-        ("time-max", "log10 of ms per frame", time, "largest error (mm)", |p| p.max_mm),
+        ("bytes-rms", "bytes per frame", bytes, "rms error (mm)", (|p| p.rms_mm) as Axis),
+        ("bytes-max", "bytes per frame", bytes, "largest error (mm)", |p| p.max_mm),
+        ("total-rms", "bytes per frame, basis included", share, "rms error (mm)", |p| p.rms_mm),
+        ("time-rms", "ms per frame", time, "rms error (mm)", |p| p.rms_mm),
+        ("time-max", "ms per frame", time, "largest error (mm)", |p| p.max_mm),
     ];
     for (name, x_label, x, y_label, y) in charts {
         let plot = plot(&measured, states, (x_label, x), (y_label, y));
@@ -120,22 +123,32 @@ fn plot(
     (y_label, y): (&str, fn(&Point) -> f64),
 ) -> Plot {
     let title = format!("{y_label} over {x_label}, {} states", states as u64);
-    let mut plot = Plot::new(&title, x_label, y_label).logarithmic();
-    for (family, prefix) in
-        [("kim2013", "kim2013"), ("toile", "toile"), ("meshopt + zstd", "meshopt")]
-    {
-        let of_family = points.iter().filter(|p| p.name.starts_with(prefix) && y(p) > 0.0);
-        let mut curve: Vec<[f64; 2]> = of_family.map(|p| [x(p), y(p)]).collect();
+    let mut plot = Plot::new(&title, x_label, y_label).logarithmic().logarithmic_along();
+    plot.size = [760, 440];
+    let tier = |p: &Point| p.name.contains("-tier");
+    let families: [(&str, &str, bool); 6] = [
+        ("plain skinning", "plain-skinning", false),
+        ("kim2013, rank 50 to 400", "kim2013", false),
+        ("toile, by bound", "toile", false),
+        ("toile, tiers of 16 to 128 columns", "toile", true),
+        ("meshopt + zstd", "meshopt", false),
+        ("full simulation", SIMULATION, false),
+    ];
+    let place = |p: &Point| [x(p), y(p).max(LEAST_MM)];
+    for (family, prefix, tiers) in families {
+        let of_family = points.iter().filter(|p| p.name.starts_with(prefix) && tier(p) == tiers);
+        let mut curve: Vec<[f64; 2]> = of_family.map(place).collect();
         curve.sort_by(|a, b| a[0].total_cmp(&b[0]));
         plot = plot.with(family, curve);
     }
-    plot.with("Pareto line", pareto(points, x, y))
+    // Simulating at run time has no place among bytes: it would beat all of them.
+    let rivals = points.iter().filter(|p| p.name != SIMULATION || x_label.starts_with("ms"));
+    plot.with("Pareto line", pareto(rivals.map(place)))
 }
 
 /// Points that no other beats in both, as stairs.
-fn pareto(points: &[Point], x: fn(&Point) -> f64, y: fn(&Point) -> f64) -> Vec<[f64; 2]> {
-    let mut sorted: Vec<[f64; 2]> =
-        points.iter().map(|p| [x(p), y(p)]).filter(|p| p[1] > 0.0).collect();
+fn pareto(points: impl Iterator<Item = [f64; 2]>) -> Vec<[f64; 2]> {
+    let mut sorted: Vec<[f64; 2]> = points.collect();
     sorted.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
     let mut line: Vec<[f64; 2]> = Vec::new();
     for point in sorted {
@@ -162,7 +175,7 @@ mod tests {
     #[test]
     fn the_pareto_line_leaves_out_what_is_beaten() {
         let points = [point(10.0, 5.0), point(20.0, 6.0), point(30.0, 1.0), point(5.0, 9.0)];
-        let line = pareto(&points, |p| p.bytes, |p| p.rms_mm);
+        let line = pareto(points.iter().map(|p| [p.bytes, p.rms_mm]));
         assert_eq!(line, [[5.0, 9.0], [10.0, 9.0], [10.0, 5.0], [30.0, 5.0], [30.0, 1.0]]);
     }
 

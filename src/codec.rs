@@ -3,7 +3,7 @@
 use std::cell::Cell;
 use std::fs::File;
 use std::io::{BufWriter, Write as _};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
@@ -12,6 +12,7 @@ use explorer::pack::Bound;
 use explorer::pack::bench::{Bench, Errors, Measured, Source, Steps};
 use serde::Serialize;
 
+pub(crate) mod contact;
 mod growth;
 
 use crate::{args, format, place, store};
@@ -152,11 +153,11 @@ pub fn bench(a: &args::CodecBench) -> Result<()> {
 }
 
 /// Opens what is to be measured.
-fn open(a: &args::CodecBench) -> Result<Source> {
-    let opened = store::open_store(&a.store)?;
-    let work = place::work(&opened, a.work.clone())?;
+fn source(store: &str, work: Option<&PathBuf>, states: Option<usize>) -> Result<Source> {
+    let opened = store::open_store(store)?;
+    let work = place::work(&opened, work.cloned())?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    Ok(runtime.block_on(Source::open(&*opened.store, &work, a.states))?)
+    Ok(runtime.block_on(Source::open(&*opened.store, &work, states))?)
 }
 
 /// Says what is being done, every few seconds.
@@ -206,7 +207,7 @@ impl Rows {
 
 /// Measures all codecs, row by row; each is printed as soon as it is there.
 pub fn measure(a: &args::CodecBench) -> Result<Outcome> {
-    let source = open(a)?;
+    let source = source(&a.store, a.work.as_ref(), a.states)?;
     let clock = CpuClock::start();
     let clock = || clock.elapsed_s();
     let say = progress();

@@ -47,6 +47,7 @@ fn main() -> ExitCode {
         Command::Codec(a) => match a.command {
             args::CodecCommand::DecodeBench(a) => decode_bench::run(&a),
             args::CodecCommand::Bench(a) => codec::bench(&a),
+            args::CodecCommand::Contact(a) => codec::contact::run(&a),
         },
     };
     match done {

@@ -36,6 +36,10 @@ struct Summary {
     bytes_received: u64,
     resident_bytes: u64,
     basis_bytes: u64,
+    /// Bytes of basis that the first cloth took, and its largest error, where it came before the
+    /// basis was whole.
+    first_cloth_basis_bytes: Option<u64>,
+    first_cloth_error_mm: Option<f32>,
     max_vertex_speed_m_s: f32,
 }
 
@@ -169,6 +173,8 @@ fn summary(character: &Character, measures: &Measures, status: &Status) -> Summa
         bytes_received: status.bytes_received,
         resident_bytes: (memory.regions + memory.links + memory.scene) as u64,
         basis_bytes: memory.basis as u64,
+        first_cloth_basis_bytes: status.first_cloth.map(|first| first.basis_bytes),
+        first_cloth_error_mm: status.first_cloth.map(|first| 1e3 * first.error_m),
         max_vertex_speed_m_s: measures.speed_max_m_s,
     }
 }

@@ -14,11 +14,22 @@ pub enum BlendMode {
     /// By a tenth a frame: the causal half of the paper's blend (Kim et al. 2013, section 3).
     #[default]
     Linear,
-    /// By a quintic that begins and ends without a jump in velocity or acceleration.
+    /// By a quintic that takes up the offset's velocity where it is known, and ends without a jump
+    /// in velocity or acceleration (inertialisation, as in Bollo, GDC 2018).
     Smooth,
 }
 
 impl BlendMode {
+    /// What an offset's velocity (a frame) adds `age` frames after it began.
+    fn of_velocity(self, age: usize) -> f32 {
+        let t = age as f32 / BLEND_FRAMES as f32;
+        match self {
+            Self::Off | Self::Linear => 0.0,
+            // 0 at both ends, 1 in its first derivative at the beginning alone.
+            Self::Smooth => BLEND_FRAMES as f32 * t * (1.0 + t * t * (t * (8.0 - 3.0 * t) - 6.0)),
+        }
+    }
+
     /// What is left of an offset `age` frames after it began; 1 at first, except where it is off.
     fn weight(self, age: usize) -> f32 {
         let t = age as f32 / BLEND_FRAMES as f32;
@@ -36,6 +47,9 @@ pub struct Blend {
     columns: usize,
     /// `BLEND_FRAMES` rows of `columns`; row `(newest + age) % BLEND_FRAMES` is `age` frames old.
     rows: Vec<f32>,
+    /// By how much each offset was growing when it began, a frame; only where `moving` says so.
+    velocities: Vec<f32>,
+    moving: [bool; BLEND_FRAMES],
     errors_m: [f32; BLEND_FRAMES],
     active: [bool; BLEND_FRAMES],
     newest: usize,
@@ -48,6 +62,8 @@ impl Blend {
         Self {
             columns,
             rows: vec![0.0; BLEND_FRAMES * columns],
+            velocities: vec![0.0; BLEND_FRAMES * columns],
+            moving: [false; BLEND_FRAMES],
             errors_m: [0.0; BLEND_FRAMES],
             active: [false; BLEND_FRAMES],
             newest: 0,
@@ -60,17 +76,22 @@ impl Blend {
         self.mode = mode;
     }
 
+    /// Whether a velocity makes a difference.
+    pub fn takes_velocity(&self) -> bool {
+        self.mode == BlendMode::Smooth
+    }
+
     /// Makes room for appended columns, which are zero in all offsets so far.
     pub fn grow(&mut self, columns: usize) {
         if columns <= self.columns {
             return;
         }
-        let mut rows = vec![0.0; BLEND_FRAMES * columns];
-        for (new, old) in rows.chunks_exact_mut(columns).zip(self.rows.chunks(self.columns.max(1)))
-        {
-            new[..self.columns].copy_from_slice(old);
+        for rows in [&mut self.rows, &mut self.velocities] {
+            let mut wider = vec![0.0; BLEND_FRAMES * columns];
+            let each = wider.chunks_exact_mut(columns).zip(rows.chunks(self.columns.max(1)));
+            each.for_each(|(new, old)| new[..self.columns].copy_from_slice(old));
+            *rows = wider;
         }
-        self.rows = rows;
         self.columns = columns;
     }
 
@@ -78,7 +99,18 @@ impl Blend {
     pub fn advance(&mut self) {
         self.newest = (self.newest + BLEND_FRAMES - 1) % BLEND_FRAMES;
         self.active[self.newest] = false;
+        self.moving[self.newest] = false;
         self.errors_m[self.newest] = 0.0;
+    }
+
+    /// Adds to the velocity of this frame's offset: by how much it grew since the frame before, by
+    /// column. After [`Blend::add`].
+    pub fn add_velocity(&mut self, velocity: impl Iterator<Item = f32>) {
+        let row = &mut self.velocities[self.newest * self.columns..][..self.columns];
+        if !std::mem::replace(&mut self.moving[self.newest], true) {
+            row.fill(0.0);
+        }
+        row.iter_mut().zip(velocity).for_each(|(sum, v)| *sum += v);
     }
 
     /// Adds the offset `from - to`, which has its full weight in this frame.
@@ -100,6 +132,7 @@ impl Blend {
     /// Forgets all offsets.
     pub fn clear(&mut self) {
         self.active = [false; BLEND_FRAMES];
+        self.moving = [false; BLEND_FRAMES];
         self.errors_m = [0.0; BLEND_FRAMES];
     }
 
@@ -107,10 +140,13 @@ impl Blend {
     pub fn apply(&self, out: &mut [f32]) {
         for age in 0..BLEND_FRAMES {
             let slot = (self.newest + age) % BLEND_FRAMES;
-            if self.active[slot] {
-                let row = &self.rows[slot * self.columns..][..self.columns];
-                for (out, offset) in out.iter_mut().zip(row) {
-                    *out += self.mode.weight(age) * offset;
+            for (there, rows, weight) in [
+                (self.active[slot], &self.rows, self.mode.weight(age)),
+                (self.moving[slot], &self.velocities, self.mode.of_velocity(age)),
+            ] {
+                if there && weight != 0.0 {
+                    let row = &rows[slot * self.columns..][..self.columns];
+                    out.iter_mut().zip(row).for_each(|(out, x)| *out += weight * x);
                 }
             }
         }
@@ -162,6 +198,24 @@ mod tests {
         assert_eq!((left(BlendMode::Smooth, 0), left(BlendMode::Smooth, 10)), (1.0, 0.0));
         assert!((left(BlendMode::Smooth, 5) - 0.5).abs() < 1e-6, "even about the middle");
         assert!(left(BlendMode::Smooth, 1) > 0.99, "no jump in velocity");
+    }
+
+    #[test]
+    fn a_velocity_is_taken_up_and_gone_at_the_end() {
+        let after = |frames| {
+            let mut blend = Blend::new(1);
+            blend.set_mode(BlendMode::Smooth);
+            blend.add(&[1.0], &[0.0]);
+            blend.add_velocity([0.03].into_iter());
+            (0..frames).for_each(|_| blend.advance());
+            let mut out = [0.0];
+            blend.apply(&mut out);
+            out[0]
+        };
+        assert_eq!((after(0), after(10)), (1.0, 0.0));
+        // Within a frame the quintic has begun to bend.
+        assert!((after(1) - 1.0 - 0.03).abs() < 0.012, "{}", after(1));
+        assert!(after(9) < 0.02, "{}", after(9));
     }
 
     #[test]

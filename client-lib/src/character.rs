@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use cloth::{Pose, Rigid};
 use codec::Basis;
-use protocol::table::Follow;
+use protocol::table::{Entry, Follow};
 use protocol::{EdgeId, PoseId, StateId};
 
 use crate::blend::Blend;
@@ -287,6 +287,7 @@ impl Character {
             if let Some((dead_end, error_m)) = follow.via {
                 if view.resident.read(dead_end, &mut scratch.state) {
                     self.blend.add(&scratch.state, &scratch.best);
+                    self.add_velocity(view, follow.state, &mut scratch);
                 } else {
                     // The links name the dead end for this frame; its target stands in for it.
                     outcome = StepOutcome::Substituted { error_m };
@@ -305,6 +306,25 @@ impl Character {
         self.shown_by = Shown::Named;
         self.scratch = scratch;
         outcome
+    }
+
+    /// The velocity of the offset that begins in this frame, where the state before the target is
+    /// known: `base` is still the state before the dead end.
+    fn add_velocity(&mut self, view: &View, target: StateId, scratch: &mut Scratch) {
+        if !self.blend.takes_velocity() || target.0 == 0 {
+            return;
+        }
+        let before = StateId(target.0 - 1);
+        let leads = match view.version.links().entry(before) {
+            Some(Entry::Interior(next)) => next.contains(&target),
+            _ => false,
+        };
+        let Scratch { state, best, difference, .. } = scratch;
+        if leads && view.resident.read(before, difference) {
+            let dead_end = state.iter().zip(&self.base).map(|(now, before)| now - before);
+            let target = best.iter().zip(&*difference).map(|(now, before)| now - before);
+            self.blend.add_velocity(dead_end.zip(target).map(|(a, b)| a - b));
+        }
     }
 
     /// Moves `base` from the substitute to its own successor, where that is resident; says how it

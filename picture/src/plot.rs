@@ -32,6 +32,8 @@ pub struct Plot {
     pub y_label: String,
     /// Whether values upwards are spaced by their logarithm. What is not above zero is left out.
     pub y_log: bool,
+    /// The same for values along.
+    pub x_log: bool,
     /// Width and height, in plot units (at least 160 x 120).
     pub size: [u32; 2],
     /// The lines, drawn in order; the first six have colours of their own.
@@ -51,12 +53,26 @@ impl Plot {
     /// An empty plot of 640 x 360 with linear axes.
     pub fn new(title: &str, x_label: &str, y_label: &str) -> Self {
         let [title, x_label, y_label] = [title, x_label, y_label].map(str::to_owned);
-        Self { title, x_label, y_label, y_log: false, size: [640, 360], series: Vec::new() }
+        Self {
+            title,
+            x_label,
+            y_label,
+            y_log: false,
+            x_log: false,
+            size: [640, 360],
+            series: Vec::new(),
+        }
     }
 
     /// The same plot with logarithmic values.
     pub fn logarithmic(mut self) -> Self {
         self.y_log = true;
+        self
+    }
+
+    /// The same plot with logarithmic values along too.
+    pub fn logarithmic_along(mut self) -> Self {
+        self.x_log = true;
         self
     }
 
@@ -92,7 +108,8 @@ impl Plot {
     }
 
     fn shown(&self, point: &[f64; 2]) -> bool {
-        point.iter().all(|value| value.is_finite()) && (!self.y_log || point[1] > 0.0)
+        let logs = [self.x_log, self.y_log];
+        point.iter().zip(logs).all(|(value, log)| value.is_finite() && (!log || *value > 0.0))
     }
 
     fn axis(&self, which: usize, from: f32, to: f32) -> Axis {
@@ -101,7 +118,7 @@ impl Plot {
         let ends = values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| {
             [low.min(value), high.max(value)]
         });
-        if which == 1 && self.y_log {
+        if [self.x_log, self.y_log][which] {
             return Axis::logarithmic(ends, from, to);
         }
         Axis::linear(ends, from, to)

@@ -81,7 +81,7 @@ impl From<&Rebase> for Rebased {
 
 /// Measures and prints.
 pub(super) fn run(a: &args::CodecBench) -> Result<()> {
-    let source = super::open(a)?;
+    let source = super::source(&a.store, a.work.as_ref(), a.states)?;
     let clock = CpuClock::start();
     let max_m = a.bound_mm.map_or(Bound::LIVE.max_m, |mm| Some(mm / 1e3));
     let bound = Bound { max_m, rms_m: None };

@@ -71,6 +71,13 @@ impl StreamingSvd {
         }
     }
 
+    /// Goes on where another one finished: what it took in weighs as much as ever. At most `rank`
+    /// columns.
+    pub fn resume(known: Columns, rank: usize) -> Self {
+        let states = Self::new(known.columns.nrows(), rank);
+        Self { columns: known.columns, singular: known.singular_values, ..states }
+    }
+
     /// Takes in one state.
     ///
     /// # Errors
@@ -208,6 +215,18 @@ mod tests {
         assert!((0.999_999..1.02).contains(&ratio), "{ratio}");
         let value = found.singular_values[0] / best.S().column_vector()[0];
         assert!((value - 1.0).abs() < 1e-6, "{value}");
+    }
+
+    #[test]
+    fn what_is_appended_weighs_as_if_it_had_been_there_at_once() {
+        let states = states(300, 600, 60, 0.002);
+        let at_once = columns(&states, 30);
+        let mut svd = StreamingSvd::resume(columns(&states[..560], 30), 30);
+        states[560..].iter().for_each(|state| svd.push(state).unwrap());
+        let appended = svd.finish().unwrap();
+        let ratio = residual(&states, appended.columns.as_ref())
+            / residual(&states, at_once.columns.as_ref());
+        assert!((0.99..1.05).contains(&ratio), "{ratio}");
     }
 
     #[test]

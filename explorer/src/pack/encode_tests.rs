@@ -106,3 +106,37 @@ fn what_is_no_state_is_refused() {
     nan[7] = f32::NAN;
     assert!(matches!(encoder.region(&nan), Err(EncodeError::Basis(_))));
 }
+
+#[test]
+fn any_number_of_workers_encode_equal_bytes() {
+    use super::design::Bound;
+    for settings in [
+        EncodeSettings::for_rank(6),
+        EncodeSettings::for_bound(Bound { max_m: Some(0.001), rms_m: None }),
+    ] {
+        let mut visit = |show: &mut dyn FnMut(&[f32]) -> Result<(), EncodeError>| {
+            (0..10).try_for_each(|r| show(&region(20 * r, 0.0)))
+        };
+        let made = columns::first_generations(ROWS, 200, &settings, &mut visit).unwrap();
+        let mut encoder = Encoder::new(&settings);
+        made.iter().for_each(|bytes| encoder.append(bytes).unwrap());
+        let encode = |encoder: &Encoder, from: usize| encoder.region(&region(from, 0.05)).unwrap();
+        let alone: Vec<_> = (0..12).map(|from| encode(&encoder, 15 * from)).collect();
+        std::thread::scope(|scope| {
+            let workers: Vec<_> = (0..4)
+                .map(|worker| {
+                    let encoder = encoder.clone();
+                    scope.spawn(move || {
+                        let own = (worker..12).step_by(4);
+                        own.map(|from| (from, encode(&encoder, 15 * from))).collect::<Vec<_>>()
+                    })
+                })
+                .collect();
+            for worker in workers {
+                for (from, region) in worker.join().unwrap() {
+                    assert_eq!(region, alone[from], "region {from}");
+                }
+            }
+        });
+    }
+}

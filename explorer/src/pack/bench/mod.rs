@@ -1,7 +1,8 @@
 //! Codecs side by side on the states of an explored store.
 //!
 //! Map: `source` exact states; `errors` what is told of vertex errors; `world` the character under
-//! them: plain skinning, skinned space; `growth` generations appended to a growing graph.
+//! them: plain skinning, skinned space; `contact` how deep cloth is in the body, and what hides it;
+//! `growth` generations appended to a growing graph.
 
 use codec::kernel::Select;
 use codec::toile::{self, TIERS};
@@ -11,11 +12,13 @@ use super::design::{Bound, Design, Spectrum};
 use super::encode::{EncodeError, EncodeSettings, Encoder};
 use super::store;
 
+mod contact;
 mod errors;
 mod growth;
 mod source;
 mod world;
 
+pub use contact::{Cleaned, Cleanup, Inside, Skin};
 pub use errors::Errors;
 pub use growth::{Batch, Growth, Rebase};
 pub use source::Source;
@@ -143,6 +146,19 @@ impl<'a> Bench<'a> {
         clock: &'a dyn Fn() -> f64,
         say: &'a dyn Fn(&str),
     ) -> Result<Self, BenchError> {
+        Self::with_rank(source, RANK_MAX, clock, say)
+    }
+
+    /// As [`Bench::new`], looking at no more than `rank` columns.
+    ///
+    /// # Errors
+    /// The states cannot be read or span nothing.
+    pub fn with_rank(
+        source: &'a Source,
+        rank: usize,
+        clock: &'a dyn Fn() -> f64,
+        say: &'a dyn Fn(&str),
+    ) -> Result<Self, BenchError> {
         super::basis::stay_on_this_thread();
         let every = source.states().div_ceil(BASIS_STATES_MAX);
         let mut block = Vec::new();
@@ -155,7 +171,7 @@ impl<'a> Bench<'a> {
                 show(&block)
             })
         };
-        let analysis = Analysis::wide(3 * source.vertices(), RANK_MAX, &mut visit)?;
+        let analysis = Analysis::wide(3 * source.vertices(), rank, &mut visit)?;
         let tree = analysis.tree();
         let spectrum = analysis.spectrum(&tree, source.states() as u64);
         Ok(Self { source, analysis, spectrum, clock, say })

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use object_store::ObjectStore;
-use protocol::links::LinkPage;
+use protocol::links::{LinkEntry, LinkPage};
 use protocol::region::RegionChunk;
 use protocol::scene::SceneChunk;
 use protocol::{PoseId, StateId};
@@ -19,7 +19,7 @@ pub struct Source {
     vertices: usize,
     scene: Option<SceneChunk>,
     /// By state id.
-    poses: Vec<PoseId>,
+    links: Vec<LinkEntry>,
     /// Processor time of simulating a state (s), where it was recorded.
     simulate_s: Option<f64>,
 }
@@ -62,16 +62,15 @@ impl Source {
             return Err(BenchError::Nothing("region"));
         }
         let scene = SceneChunk::decode(&store::chunk(from, &garment.scene).await?)?;
-        let mut poses = Vec::with_capacity(all);
+        let mut links = Vec::with_capacity(all);
         for page in &garment.links {
-            let page = LinkPage::decode(&store::chunk(from, page).await?)?;
-            poses.extend(page.entries.iter().map(|entry| entry.pose()));
+            links.extend(LinkPage::decode(&store::chunk(from, page).await?)?.entries);
         }
         let cpu = std::fs::read(work.join("simulate_cpu_s")).ok();
         let cpu = cpu.and_then(|bytes| Some(f64::from_le_bytes(bytes.try_into().ok()?)));
         let simulate_s = cpu.filter(|s| s.is_finite() && *s > 0.0).map(|s| s / all as f64);
         let (states, scene) = (Exact::File(file), Some(scene));
-        Ok(Self { states, regions, vertices, scene, poses, simulate_s })
+        Ok(Self { states, regions, vertices, scene, links, simulate_s })
     }
 
     /// States in memory, `3 * vertices` numbers each (m), in regions of `count`.
@@ -79,8 +78,8 @@ impl Source {
         let all = states.len() / (3 * vertices);
         let region = |first: usize| (StateId(first as u64), count.min(all - first));
         let regions = (0..all).step_by(count).map(region).collect();
-        let (states, poses) = (Exact::Memory(states), Vec::new());
-        Self { states, regions, vertices, scene: None, poses, simulate_s: None }
+        let (states, links) = (Exact::Memory(states), Vec::new());
+        Self { states, regions, vertices, scene: None, links, simulate_s: None }
     }
 
     /// Vertices of a state.
@@ -110,7 +109,36 @@ impl Source {
 
     /// The pose of a state, where a store was opened.
     pub fn pose(&self, state: StateId) -> Option<PoseId> {
-        self.poses.get(state.0 as usize).copied()
+        self.link(state).map(LinkEntry::pose)
+    }
+
+    fn link(&self, state: StateId) -> Option<&LinkEntry> {
+        self.links.get(state.0 as usize)
+    }
+
+    /// Whether a state is playable and one of its edges leads to another.
+    pub fn leads(&self, from: StateId, to: StateId) -> bool {
+        matches!(self.link(from), Some(LinkEntry::Interior { next, .. }) if next.contains(&to))
+    }
+
+    /// What a dead end is merged into; `None` for any other state.
+    pub fn merged_into(&self, dead_end: StateId) -> Option<StateId> {
+        match self.link(dead_end)? {
+            LinkEntry::DeadEnd { target, .. } => Some(*target),
+            _ => None,
+        }
+    }
+
+    /// The first playable state that a playable state leads to without a merge.
+    pub fn next_playable(&self, state: StateId) -> Option<StateId> {
+        let Some(LinkEntry::Interior { next, .. }) = self.link(state) else { return None };
+        let playable = |s: &&StateId| matches!(self.link(**s), Some(LinkEntry::Interior { .. }));
+        next.iter().find(playable).copied()
+    }
+
+    /// How many states have links.
+    pub fn linked_states(&self) -> u64 {
+        self.links.len() as u64
     }
 
     /// Processor time of simulating one state (s), as the work folder recorded it.

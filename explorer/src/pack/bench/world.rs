@@ -268,7 +268,7 @@ impl Bench<'_> {
     }
 }
 
-fn body(scene: &SceneChunk, mesh: &BodyMesh) -> Body {
+pub(super) fn body(scene: &SceneChunk, mesh: &BodyMesh) -> Body {
     let joints = || scene.joints.iter();
     let rest = |joint: &protocol::scene::Joint| Rigid {
         rotation: Quat::from_array(joint.rest_rotation).normalize(),
@@ -288,7 +288,7 @@ fn body(scene: &SceneChunk, mesh: &BodyMesh) -> Body {
     }
 }
 
-fn pose_of(scene: &SceneChunk, pose: PoseId) -> Pose {
+pub(super) fn pose_of(scene: &SceneChunk, pose: PoseId) -> Pose {
     let pose = &scene.poses[pose.index()];
     let rotation = |q: &[i16; 4]| Quat::from_array(q.map(f32::from)).normalize();
     Pose { root: Vec3::from(pose.root), rotations: pose.rotations.iter().map(rotation).collect() }

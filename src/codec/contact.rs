@@ -1,0 +1,266 @@
+//! `toile codec contact`: how deep shown cloth is in the body, what hides it, and blends at merges.
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use client_lib::blend::{BLEND_FRAMES, Blend};
+use client_lib::{BlendMode, StateId};
+use explorer::cpu::CpuClock;
+use explorer::pack::Bound;
+use explorer::pack::bench::{Bench, Cleaned, Inside, Skin, Source};
+use serde::Serialize;
+
+use crate::{args, format};
+
+/// Columns looked at.
+const RANK_MAX: usize = 400;
+/// Frames before a merge whose accelerations are counted with it.
+const BEFORE: usize = 2;
+
+/// The promised keys.
+#[derive(Debug, Serialize)]
+struct Outcome {
+    bound_mm: f32,
+    states: usize,
+    exact: Depths,
+    decoded: Depths,
+    shrunk: Depths,
+    shrunk_and_offset: Depths,
+    shrink_mm_max: f32,
+    depth_offset_mm_max: f32,
+    merges: usize,
+    blends: Vec<Blended>,
+}
+
+#[derive(Debug, Serialize)]
+struct Depths {
+    inside_share: f64,
+    deeper_than_2mm_share: f64,
+    max_mm: f32,
+}
+
+/// One way to blend. Accelerations are the largest of any vertex in a frame, in the state frame.
+#[derive(Debug, Serialize)]
+struct Blended {
+    name: &'static str,
+    /// Largest over the frames of a merge: median over merges (m/s^2).
+    acceleration_p50_m_s2: f64,
+    acceleration_p99_m_s2: f64,
+    /// Root mean square over all vertices and frames of the change of velocity in a frame.
+    jump_rms_m_s2: f64,
+    inside_share: f64,
+    deeper_than_2mm_share: f64,
+    max_mm: f32,
+}
+
+impl From<&Inside> for Depths {
+    fn from(inside: &Inside) -> Self {
+        let share = |count: u64| count as f64 / inside.vertices.max(1) as f64;
+        Self {
+            inside_share: share(inside.inside),
+            deeper_than_2mm_share: share(inside.deep),
+            max_mm: 1e3 * inside.max_m,
+        }
+    }
+}
+
+/// Measures and prints.
+pub(crate) fn run(a: &args::CodecContact) -> Result<()> {
+    let source = super::source(&a.store, a.work.as_ref(), Some(a.states))?;
+    let clock = CpuClock::start();
+    let (clock, say) = (|| clock.elapsed_s(), super::progress());
+    let bench = Bench::with_rank(&source, RANK_MAX, &clock, &say)?;
+    let bound = Bound { max_m: Some(a.bound_mm / 1e3), rms_m: None };
+    let cleaned = bench.cleanup(bound)?.context("the store gives no body away")?;
+    if let Some(file) = &a.out {
+        write(file, &cleaned)?;
+    }
+    let (merges, blends) = blends(&source, a.merges)?;
+    let most = |of: &[f32]| 1e3 * of.iter().copied().fold(0.0, f32::max);
+    let outcome = Outcome {
+        bound_mm: a.bound_mm,
+        states: cleaned.states,
+        exact: Depths::from(&cleaned.exact),
+        decoded: Depths::from(&cleaned.decoded),
+        shrunk: Depths::from(&cleaned.shrunk),
+        shrunk_and_offset: Depths::from(&cleaned.offset),
+        shrink_mm_max: most(&cleaned.cleanup.shrink_m),
+        depth_offset_mm_max: most(&cleaned.cleanup.depth_offset_m),
+        merges,
+        blends,
+    };
+    if a.json {
+        return format::print_json(&outcome);
+    }
+    println!(
+        "{} held-out states, within {} mm   in the body  deeper than 2 mm   deepest",
+        outcome.states, outcome.bound_mm
+    );
+    for (name, depths) in [
+        ("as simulated", &outcome.exact),
+        ("decoded", &outcome.decoded),
+        ("... and a thinner body", &outcome.shrunk),
+        ("... and a depth offset", &outcome.shrunk_and_offset),
+    ] {
+        let Depths { inside_share, deeper_than_2mm_share, max_mm } = depths;
+        println!(
+            "{name:<36} {:>10.3} % {:>15.3} % {max_mm:>6.2} mm",
+            100.0 * inside_share,
+            100.0 * deeper_than_2mm_share
+        );
+    }
+    println!(
+        "{merges} merges      acceleration p50, p99 (m/s^2)   jump rms   in the body   > 2 mm"
+    );
+    for b in &outcome.blends {
+        println!(
+            "{:<22} {:>10.1} {:>10.1} {:>15.2} {:>10.3} % {:>8.3} %",
+            b.name,
+            b.acceleration_p50_m_s2,
+            b.acceleration_p99_m_s2,
+            b.jump_rms_m_s2,
+            100.0 * b.inside_share,
+            100.0 * b.deeper_than_2mm_share
+        );
+    }
+    Ok(())
+}
+
+/// Two counts (u32), then the body's and the garment's numbers (f32, m), little-endian.
+fn write(file: &Path, cleaned: &Cleaned) -> Result<()> {
+    let (shrink, offset) = (&cleaned.cleanup.shrink_m, &cleaned.cleanup.depth_offset_m);
+    let mut bytes = Vec::new();
+    for count in [shrink.len(), offset.len()] {
+        bytes.extend_from_slice(&(count as u32).to_le_bytes());
+    }
+    shrink.iter().chain(offset).for_each(|x| bytes.extend_from_slice(&x.to_le_bytes()));
+    std::fs::write(file, bytes).with_context(|| format!("writing {}", file.display()))
+}
+
+/// A merge that can be followed for as long as its blend takes.
+struct Merge {
+    /// The states before the dead end, oldest first, and the dead end.
+    before: Vec<StateId>,
+    /// The state before the target, the target, and what follows it.
+    target: Vec<StateId>,
+}
+
+/// The merge at a dead end, where its neighbours are of the same trajectories.
+fn merge(source: &Source, dead_end: StateId) -> Option<Merge> {
+    let target = source.merged_into(dead_end)?;
+    let first = dead_end.0.checked_sub(BEFORE as u64)?;
+    let before: Vec<StateId> = (first..=dead_end.0).map(StateId).collect();
+    let mut walk = vec![StateId(target.0.checked_sub(1)?), target];
+    while walk.len() < BLEND_FRAMES + 3 {
+        walk.push(source.next_playable(*walk.last()?)?);
+    }
+    let straight = |run: &[StateId]| run.windows(2).all(|w| source.leads(w[0], w[1]));
+    (straight(&before) && straight(&walk)).then_some(Merge { before, target: walk })
+}
+
+/// Plays merges spread over the graph with every way to blend.
+fn blends(source: &Source, wanted: usize) -> Result<(usize, Vec<Blended>)> {
+    let all: Vec<Merge> =
+        (0..source.linked_states()).filter_map(|state| merge(source, StateId(state))).collect();
+    let every = all.len().div_ceil(wanted.max(1)).max(1);
+    let merges: Vec<&Merge> = all.iter().step_by(every).collect();
+    let scene = source.scene().context("a store has a scene")?;
+    let skin = Skin::new(scene).context("the store gives no body away")?;
+    let ways = [
+        ("no blend", BlendMode::Off, false),
+        ("linear", BlendMode::Linear, false),
+        ("smooth, offset alone", BlendMode::Smooth, false),
+        ("inertialised", BlendMode::Smooth, true),
+    ];
+    let mut found: Vec<Played> = ways.iter().map(|_| Played::default()).collect();
+    let fps = f64::from(scene.fps);
+    for merge in &merges {
+        let read = |states: &[StateId]| -> Result<Vec<Vec<f32>>> {
+            let one = |state: &StateId| {
+                let mut out = vec![0.0; 3 * source.vertices()];
+                source.read_state(*state, &mut out).map(|()| out)
+            };
+            Ok(states.iter().map(one).collect::<std::io::Result<_>>()?)
+        };
+        let (before, target) = (read(&merge.before)?, read(&merge.target)?);
+        let bodies: Vec<_> = merge.target[2..]
+            .iter()
+            .filter_map(|state| Some(skin.posed(source.pose(*state)?)))
+            .collect();
+        for ((_, mode, moving), played) in ways.iter().zip(&mut found) {
+            let shown = play(&before, &target, *mode, *moving);
+            played.accelerations(&shown, fps);
+            for (shown, body) in shown[BEFORE + 1..].iter().zip(&bodies) {
+                skin.inside(body, shown, &mut played.inside);
+            }
+        }
+    }
+    let rows = ways.iter().zip(found).map(|((name, ..), played)| played.row(name));
+    Ok((merges.len(), rows.collect()))
+}
+
+/// What is shown: the states before, the dead end (the target and all of the offset), and on.
+fn play(before: &[Vec<f32>], target: &[Vec<f32>], mode: BlendMode, moving: bool) -> Vec<Vec<f32>> {
+    let dead_end = &before[BEFORE];
+    let mut blend = Blend::new(dead_end.len());
+    blend.set_mode(mode);
+    blend.add(dead_end, &target[1]);
+    if moving {
+        let own = dead_end.iter().zip(&before[BEFORE - 1]).map(|(now, then)| now - then);
+        let its = target[1].iter().zip(&target[0]).map(|(now, then)| now - then);
+        blend.add_velocity(own.zip(its).map(|(a, b)| a - b));
+    }
+    let mut shown = before[..BEFORE].to_vec();
+    for state in &target[1..] {
+        let mut state = state.clone();
+        blend.apply(&mut state);
+        blend.advance();
+        shown.push(state);
+    }
+    shown
+}
+
+#[derive(Default)]
+struct Played {
+    largest: Vec<f64>,
+    square: f64,
+    count: u64,
+    inside: Inside,
+}
+
+impl Played {
+    fn accelerations(&mut self, shown: &[Vec<f32>], fps: f64) {
+        let mut largest = 0.0f64;
+        for frames in shown.windows(3) {
+            let [a, b, c] = [&frames[0], &frames[1], &frames[2]].map(|f| f.as_chunks::<3>().0);
+            for ((a, b), c) in a.iter().zip(b).zip(c) {
+                let square: f64 = (0..3)
+                    .map(|i| f64::from(a[i]) - 2.0 * f64::from(b[i]) + f64::from(c[i]))
+                    .map(|x| (x * fps * fps).powi(2))
+                    .sum();
+                largest = largest.max(square);
+                self.square += square;
+                self.count += 1;
+            }
+        }
+        self.largest.push(largest.sqrt());
+    }
+
+    fn row(mut self, name: &'static str) -> Blended {
+        self.largest.sort_by(f64::total_cmp);
+        let at = |share: f64| {
+            let last = self.largest.len().saturating_sub(1) as f64;
+            self.largest.get((share * last).round() as usize).copied().unwrap_or(0.0)
+        };
+        let depths = Depths::from(&self.inside);
+        Blended {
+            name,
+            acceleration_p50_m_s2: at(0.5),
+            acceleration_p99_m_s2: at(0.99),
+            jump_rms_m_s2: (self.square / self.count.max(1) as f64).sqrt(),
+            inside_share: depths.inside_share,
+            deeper_than_2mm_share: depths.deeper_than_2mm_share,
+            max_mm: depths.max_mm,
+        }
+    }
+}
