@@ -7,6 +7,7 @@ use glam::Vec3;
 use crate::body::Body;
 use crate::material::{Material, MaterialError};
 use crate::mesh::Mesh;
+use crate::solver::aggregate::Shares;
 use crate::solver::bending;
 use crate::solver::matrix::Pattern;
 use crate::surface::{Posed, Surface};
@@ -71,6 +72,8 @@ pub struct Model {
     /// Vertex masses (kg).
     pub(crate) masses: Vec<f32>,
     pub(crate) pattern: Pattern,
+    /// Coarse nodes of the preconditioner.
+    pub(crate) shares: Shares,
     /// Over the garment's triangles.
     pub(crate) tree: Tree,
     /// Layer of each vertex, counted outwards; empty where all are one.
@@ -159,6 +162,7 @@ impl Model {
             bending: bending::Stiffness::new(&mesh, &pattern, material.bend),
             held_edges,
             homes,
+            shares: Shares::new(&mesh, &pattern, held),
             tree: Tree::new(&mesh),
             layers: Vec::new(),
             pattern,

@@ -4,6 +4,8 @@ use std::ops::Range;
 
 use glam::{Mat3A, Vec3A};
 
+use super::aggregate::Shares;
+use super::coarse_level::CoarseLevel;
 use super::simd::{self, Set, Task};
 use crate::mesh::Mesh;
 use crate::solver::self_contact::Rows as PairRows;
@@ -67,6 +69,7 @@ pub(crate) struct Scratch {
     inverse: Vec<Mat3A>,
     z: Vec<Vec3A>,
     p: Vec<Vec3A>,
+    pub(crate) coarse: CoarseLevel,
     q: Vec<Vec3A>,
 }
 
@@ -79,6 +82,7 @@ pub(crate) struct Given<'a> {
     /// A force per vertex that counts as large: residuals are measured against it, or against
     /// the first one if that is larger.
     pub(crate) reference: &'a [Vec3A],
+    pub(crate) shares: &'a Shares,
     pub(crate) stop: Stop,
 }
 
@@ -205,7 +209,7 @@ impl Matrix {
     /// Improves `x` as a solution of `A x = b`, where `b` stands in `s.residual`, by conjugate
     /// gradients with the inverted diagonal blocks as preconditioner. Returns the iterations.
     pub(crate) fn solve(&self, given: Given<'_>, x: &mut [Vec3A], s: &mut Scratch) -> u32 {
-        let Given { pattern, held, reference, stop } = given;
+        let Given { pattern, held, reference, shares, stop } = given;
         s.size(x.len());
         self.multiply(pattern, x, &mut s.q);
         let mut floor = 0.0;
@@ -216,14 +220,18 @@ impl Matrix {
         }
         let mut rz = s.precondition();
         let enough = stop.tolerance * stop.tolerance * rz.max(floor);
+        // How much is left is told by the first level alone, which does not change.
+        let mut left = rz;
+        rz = s.correct(shares, rz);
         s.p.copy_from_slice(&s.z);
         let mut iterations = 0;
-        while rz > enough && iterations < stop.iterations {
+        while left > enough && iterations < stop.iterations {
             let curvature = self.multiply(pattern, &s.p, &mut s.q);
             if !curvature.is_normal() || curvature < 0.0 {
                 break;
             }
-            let next = simd::run(Advance { alpha: rz / curvature, x, s });
+            left = simd::run(Advance { alpha: rz / curvature, x, s });
+            let next = s.correct(shares, left);
             let beta = next / rz;
             rz = next;
             for (p, z) in s.p.iter_mut().zip(&s.z) {
@@ -268,6 +276,14 @@ impl Scratch {
         for v in [&mut self.z, &mut self.p, &mut self.q] {
             v.resize(count, Vec3A::ZERO);
         }
+    }
+
+    /// Adds the coarse level's part to `z`; returns `r . z`, which was `rz`.
+    fn correct(&mut self, shares: &Shares, rz: f32) -> f32 {
+        if !self.coarse.ready {
+            return rz;
+        }
+        self.coarse.correct(shares, &self.residual, &mut self.z)
     }
 
     /// `z = D^-1 r`; returns `r . z`.

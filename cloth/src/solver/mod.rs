@@ -1,10 +1,12 @@
-//! The step: implicit Euler, one projected Newton linearisation and two contact passes a substep.
+//! The step: implicit Euler, two projected Newton linearisations and contact passes a substep.
 //!
 //! The first pass keeps the cloth off the contact planes found at the substep's beginning, the
-//! second, started where the first ended, off those found at its end. Baraff & Witkin 1998 for
+//! second, linearised where the first ended, off those found at its end. Baraff & Witkin 1998 for
 //! the implicit system, Kim & Eberle 2022 for projection; contact and limits as their modules say.
 
+pub(crate) mod aggregate;
 pub(crate) mod bending;
+pub(crate) mod coarse_level;
 pub(crate) mod contact;
 pub(crate) mod limit;
 pub(crate) mod matrix;
@@ -33,6 +35,10 @@ const BODY_WAY_M: f32 = 0.03;
 const DEPTH_FOUND_M: f32 = 0.12;
 /// How readily a held vertex gives way to the strain limit, against a free one.
 const HELD_SHARE: f32 = 0.02;
+/// The ground is looked for this far further down than a vertex moves (m).
+const NEAR_M: f32 = 0.005;
+/// Deeper than this a vertex is put back on its contact plane after the solve (m).
+const SLACK_M: f32 = 1e-5;
 /// No vertex moves faster (m/s).
 pub const SPEED_MAX_M_S: f32 = 40.0;
 
@@ -141,7 +147,7 @@ pub fn step(
         if let Some((from, to)) = span.motion {
             ws.pose_body(model, from, to, (substep + 1) as f32 / substeps as f32);
         }
-        ws.substep(model, dt, body_way, &mut effort);
+        ws.substep(model, dt, body_way, substep == 0, &mut effort);
         let finite = |(x, v): (&Vec3A, &Vec3A)| x.is_finite() && v.is_finite();
         if let Some(vertex) = ws.x.iter().zip(&ws.v).position(|p| !finite(p)) {
             let position = ws.x[vertex].into();
@@ -225,16 +231,19 @@ impl Workspace {
         }
     }
 
-    fn substep(&mut self, model: &Model, dt: f32, body_way: f32, effort: &mut Effort) {
+    fn substep(&mut self, model: &Model, dt: f32, body_way: f32, first: bool, effort: &mut Effort) {
         effort.substeps = effort.substeps.max(1);
         self.set_guess(model, dt);
         self.carry_rows(model, dt);
-        self.assemble(model, dt);
-        self.add_air(model, model.environment.wind, dt);
-        self.bare.copy_from_slice(&self.matrix.diagonal);
+        let wind = model.environment.wind;
+        self.assemble(model, wind, dt, true);
+        if first {
+            self.scratch.coarse.gather(&model.shares, &model.pattern, &self.matrix);
+        }
         effort.iterations += self.pass(model, dt, true);
         self.find_rows(model, dt, body_way);
         self.find_pairs(model);
+        self.assemble(model, wind, dt, false);
         effort.iterations += self.pass(model, dt, false);
         self.finish(model, dt, effort);
     }
@@ -277,7 +286,7 @@ impl Workspace {
                 }
             }
             self.rows[i] = if meets(&row, ahead) { row } else { Row::default() };
-            self.ground[i] = ground_row(model, ahead);
+            self.ground[i] = ground_row(model, ahead, 0.0);
         }
     }
 
@@ -287,7 +296,7 @@ impl Workspace {
         for i in 0..self.x.len() {
             let at = self.x[i] + self.dx[i];
             self.loads[i] = [self.rows[i].load(at), self.ground[i].load(at)];
-            self.ground[i] = ground_row(model, at);
+            self.ground[i] = ground_row(model, at, self.dx[i].length() + NEAR_M);
             let Some(c) = &model.body else { continue };
             if self.recovery.led[i] {
                 continue;
@@ -331,15 +340,16 @@ impl Workspace {
             self.self_contact.add_rows(model, pass, &mut self.matrix, force);
         }
         let (held, reference) = (&self.held[..], &self.reference[..]);
-        let given = Given { pattern: &model.pattern, held, reference, stop };
+        self.scratch.coarse.factorise(&model.shares, &self.bare, &self.matrix.diagonal);
+        let shares = &model.shares;
+        let given = Given { pattern: &model.pattern, held, reference, shares, stop };
         self.matrix.solve(given, &mut self.dx, &mut self.scratch)
     }
 
-    /// Matrix and right-hand side (in `forces`) of inertia, gravity, bending, membrane and damping,
-    /// linearised where the substep begins.
-    fn assemble(&mut self, model: &Model, dt: f32) {
+    /// Matrix and right-hand side (in `forces`) of inertia, gravity, air, bending, membrane and
+    /// damping, linearised where the substep begins, or then where the first pass has led.
+    fn assemble(&mut self, model: &Model, wind: Vec3, dt: f32, first: bool) {
         let scale = 1.0 + model.material.damping_s / dt;
-        let gravity = Vec3A::from(model.environment.gravity);
         let (matrix, bending) = (&mut self.matrix, &model.bending);
         matrix.pairs.0.clear();
         for (block, slot) in matrix.upper.iter_mut().zip(&model.pattern.near_upper.whole) {
@@ -349,17 +359,35 @@ impl Workspace {
         for (far, exact) in matrix.far.iter_mut().zip(&bending.far) {
             *far = exact * scale;
         }
-        for (i, (d, w)) in matrix.diagonal.iter_mut().zip(&bending.diagonal).enumerate() {
-            let inertia = model.masses[i] / (dt * dt);
-            *d = Mat3A::from_diagonal(Vec3::splat(w * scale + inertia));
-            self.forces[i] = gravity * model.masses[i] + self.v[i] * (dt * inertia);
+        for (d, w) in matrix.diagonal.iter_mut().zip(&bending.diagonal) {
+            *d = Mat3A::from_diagonal(Vec3::splat(w * scale));
         }
-        bending.add_forces(&model.pattern, &self.x, &mut self.forces);
+        let (mesh, pattern, x) = (&model.mesh, &model.pattern, &mut self.ends);
+        x.copy_from_slice(&self.x);
+        if !first {
+            x.iter_mut().zip(&self.dx).for_each(|(x, dx)| *x += *dx);
+        }
+        self.forces.fill(Vec3A::ZERO);
+        bending.add_forces(pattern, x, &mut self.forces);
         let constants = membrane::Constants::new(&model.material);
-        let (mesh, pattern) = (&model.mesh, &model.pattern);
         let sums = membrane::Sums { forces: &mut self.forces, matrix: &mut *matrix };
-        membrane::assemble(mesh, pattern, constants, scale, &self.x, sums);
+        membrane::assemble(mesh, pattern, constants, scale, x, sums);
         matrix.mirror(pattern);
+        if !first {
+            // The unknowns are whole ways, of which the forces are told some way on.
+            matrix.multiply(pattern, &self.dx, &mut self.normals);
+            for (force, slope) in self.forces.iter_mut().zip(&self.normals) {
+                *force += *slope * (1.0 / scale);
+            }
+        }
+        let gravity = Vec3A::from(model.environment.gravity);
+        for (i, d) in matrix.diagonal.iter_mut().enumerate() {
+            let inertia = model.masses[i] / (dt * dt);
+            *d += Mat3A::from_diagonal(Vec3::splat(inertia));
+            self.forces[i] += gravity * model.masses[i] + self.v[i] * (dt * inertia);
+        }
+        self.add_air(model, wind, dt);
+        self.bare.copy_from_slice(&self.matrix.diagonal);
     }
 
     /// Drag on each vertex's share of the sheet, along the sheet's normal.
@@ -413,11 +441,17 @@ impl Workspace {
     /// Strain limit, new velocities and positions.
     fn finish(&mut self, model: &Model, dt: f32, effort: &mut Effort) {
         let ends = &mut self.ends;
-        for ((end, x), dx) in ends.iter_mut().zip(&self.x).zip(&self.dx) {
-            *end = *x + *dx;
-        }
-        for (i, end) in ends.iter().enumerate() {
+        for (i, end) in ends.iter_mut().enumerate() {
+            *end = self.x[i] + self.dx[i];
             self.loads[i] = [self.rows[i].load(*end), self.ground[i].load(*end)];
+            for row in [&self.rows[i], &self.ground[i]] {
+                // What the second pass led in where the first had not.
+                if row.kind == Kind::Plane && !self.held[i] && row.gap(*end) < -SLACK_M {
+                    let out = row.push_out(*end);
+                    self.dx[i] += out - *end;
+                    *end = out;
+                }
+            }
         }
         let own = model.environment.self_contact;
         if own {
@@ -463,7 +497,12 @@ fn meets(row: &Row, at: Vec3A) -> bool {
     row.kind == Kind::Held || row.kind == Kind::Plane && row.gap(at) < 0.0
 }
 
-fn ground_row(model: &Model, at: Vec3A) -> Row {
+/// The ground, where it is less than `reach` (m) further down than it must stay.
+fn ground_row(model: &Model, at: Vec3A, reach: f32) -> Row {
     let offset = model.material.offset;
-    if model.environment.ground && at.y < offset { Row::ground(at, offset) } else { Row::default() }
+    if model.environment.ground && at.y < offset + reach {
+        Row::ground(at, offset)
+    } else {
+        Row::default()
+    }
 }

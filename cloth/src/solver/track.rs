@@ -269,9 +269,7 @@ pub fn step_tracked(
     for ((dx, x), at) in ws.dx.iter_mut().zip(&ws.x).zip(&ws.ends) {
         *dx = *at - *x;
     }
-    ws.assemble(model, dt);
-    ws.add_air(model, guide.wind, dt);
-    ws.bare.copy_from_slice(&ws.matrix.diagonal);
+    ws.assemble(model, guide.wind, dt, true);
     let mut iterations = 0;
     if ws.meet(model, guide, true) {
         iterations += ws.tracked_pass(model, tracker, dt, true);

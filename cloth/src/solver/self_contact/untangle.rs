@@ -12,7 +12,7 @@ use super::SelfContact;
 use crate::model::Model;
 
 /// Edge and triangle are shifted against each other by this in a substep (m).
-const SHIFT_M: f32 = 1.5e-3;
+const SHIFT_M: f32 = 2.5e-3;
 /// Edges nearly in the triangle's plane count as this steep.
 const STEEP: f32 = 0.1;
 
