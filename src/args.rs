@@ -142,6 +142,9 @@ pub struct Explore {
     /// Stop before less than this is left on the disk (MB).
     #[arg(long, value_name = "MB", default_value_t = 256)]
     pub keep_free: u64,
+    /// Publish a learned upsampler with a later version, so that cloth can leave the graph.
+    #[arg(long)]
+    pub upsampler: bool,
     /// The paper's plain algorithm: no early stop, no re-merging.
     #[arg(long)]
     pub paper: bool,
@@ -194,6 +197,12 @@ pub struct Play {
     /// At the scene's rate instead of as fast as possible.
     #[arg(long)]
     pub realtime: bool,
+    /// Push the cloth each time so many frames have passed; it needs an upsampler.
+    #[arg(long, value_name = "FRAMES", value_parser = clap::value_parser!(u64).range(1..))]
+    pub push_every: Option<u64>,
+    /// Let a wind blow in the middle third of the walk (m/s, along x); it needs an upsampler.
+    #[arg(long, value_name = "M/S", value_parser = wind)]
+    pub wind: Option<f32>,
     /// Write body and cloth as an animated glTF file.
     #[arg(long, value_name = "FILE.glb")]
     pub export: Option<PathBuf>,
@@ -506,6 +515,11 @@ fn duration(text: &str) -> Result<Duration, String> {
     };
     let value: f64 = digits.parse().map_err(|_| "expected a time such as 60s or 5m".to_string())?;
     Duration::try_from_secs_f64(value * seconds).map_err(|e| e.to_string())
+}
+
+fn wind(text: &str) -> Result<f32, String> {
+    let speed = text.parse::<f32>().ok().filter(|m_s| m_s.abs() <= client_lib::free::FORCE_MAX);
+    speed.ok_or_else(|| format!("metres a second, at most {}", client_lib::free::FORCE_MAX))
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, ensure};
 use explorer::explore::{End, ExploreOptions, Place, Progress, Summary, explore};
 use explorer::grow::ledger::Phase;
+use explorer::pack::upsampler::UpsamplerSettings;
 use explorer::pipe::simulators;
 use explorer::scene::Scene;
 
@@ -35,6 +36,7 @@ pub fn run(a: args::Explore) -> Result<()> {
         policy: a.policy,
         clips: a.clips,
         keep_free_bytes: a.keep_free.saturating_mul(1_000_000),
+        upsampler: a.upsampler.then(UpsamplerSettings::default),
         paper: a.paper,
         best_prefix_at_end: true,
         should_stop: stop.asked(),

@@ -13,6 +13,7 @@ mod lab_record;
 mod live;
 mod place;
 mod play;
+mod play_forces;
 mod plot;
 mod recall;
 mod record;

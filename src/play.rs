@@ -9,6 +9,7 @@ use glam::Vec3;
 use serde::Serialize;
 
 use crate::live::Live;
+use crate::play_forces::{self, Forces, Seams};
 use crate::record::Recorder;
 use crate::{args, format};
 
@@ -41,6 +42,8 @@ struct Summary {
     first_cloth_basis_bytes: Option<u64>,
     first_cloth_error_mm: Option<f32>,
     max_vertex_speed_m_s: f32,
+    #[serde(flatten)]
+    seams: Seams,
 }
 
 /// Plays a walk and prints what was shown.
@@ -58,6 +61,8 @@ pub fn run(a: &args::Play) -> Result<()> {
     let mut walk = Walk::new(&spec, &scene, character.pose())?;
     let mut live = Live::new(Some(a.frames));
     let mut measures = Measures::new(&character);
+    let mut forces = Forces::new(a);
+    forces.wait(&mut character, READY_TIMEOUT)?;
     let tick = Duration::from_secs_f32(1.0 / scene.fps());
     let start = Instant::now();
     for frame in 0..a.frames {
@@ -71,8 +76,10 @@ pub fn run(a: &args::Play) -> Result<()> {
         } else if frame % AHEAD_FRAMES == 0 {
             client.wait_ahead(AHEAD_TIMEOUT);
         }
+        forces.act(&mut character, frame);
         character.step(next);
         measures.decode(&mut character)?;
+        forces.see(&character, &measures.rows);
         recorder.frame(&character, &measures.world)?;
         live.tell(frame + 1, || {
             let stats = character.stats();
@@ -82,7 +89,7 @@ pub fn run(a: &args::Play) -> Result<()> {
     }
     live.done();
     let status = client.status();
-    let summary = summary(&character, &measures, &status);
+    let summary = summary(&character, &measures, &status, forces.seams(&character));
     recorder.finish(&character)?;
     if a.json {
         return format::print_json(&summary);
@@ -158,7 +165,7 @@ impl Measures {
     }
 }
 
-fn summary(character: &Character, measures: &Measures, status: &Status) -> Summary {
+fn summary(character: &Character, measures: &Measures, status: &Status, seams: Seams) -> Summary {
     let (stats, memory) = (character.stats(), &status.memory);
     Summary {
         frames: stats.frames,
@@ -176,6 +183,7 @@ fn summary(character: &Character, measures: &Measures, status: &Status) -> Summa
         first_cloth_basis_bytes: status.first_cloth.map(|first| first.basis_bytes),
         first_cloth_error_mm: status.first_cloth.map(|first| 1e3 * first.error_m),
         max_vertex_speed_m_s: measures.speed_max_m_s,
+        seams,
     }
 }
 
@@ -195,4 +203,5 @@ fn print(s: &Summary) {
         format::bytes(s.bytes_received),
         format::bytes(s.resident_bytes)
     );
+    play_forces::print(&s.seams);
 }

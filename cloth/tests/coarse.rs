@@ -1,5 +1,7 @@
 //! The run-time face: what it must survive (wind, shaking, fast balls, any step, teleports, any
 //! material, long runs), and that it hangs, swings and rests as cloth does.
+//!
+//! Every threshold is derived from the scene, never from what the solver did: see the constants.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -32,9 +34,17 @@ unsafe impl GlobalAlloc for Counting {
 static COUNTING: Counting = Counting;
 
 const DT: f32 = 1.0 / 60.0;
-/// What counts as rest (m/s), and the seconds after which it must be reached, whatever happened.
+const GRAVITY: f32 = 9.81;
+/// What counts as rest (m/s).
 const REST_M_S: f32 = 0.1;
-const REST_S: f32 = 20.0;
+/// Seconds after which it must be reached, whatever happened. A sheet of 1 m goes fastest after a fall
+/// from straight up to straight down, sqrt(2 g 2 m) = 6.3 m/s (what is faster, air stops at once);
+/// the default damping of 0.5 a second takes half of that from a swing's amplitude, so its speed falls
+/// as exp(-t / 4 s): ln(6.3 / 0.1) * 4 s.
+const REST_S: f32 = 16.6;
+/// However it comes to hang (wound about itself too: it does not meet itself), no edge can carry more than
+/// the whole sheet: its weight, 0.2 * 9.81 N, on the width of one edge, 1/13 m, of 1000 N/m.
+const REST_STRETCH: f32 = 0.2 * GRAVITY * 13.0 / 1000.0;
 
 /// A hanging sheet of n x n points and one square metre, held along its top edge.
 struct Flag {
@@ -104,9 +114,9 @@ impl Flag {
     }
 }
 
-/// A sheet of 1 m held along 1 m never reaches further than this from the middle of its pins, even
-/// at the strain limit (m).
-const EXTENT_MAX: f32 = 1.7;
+/// A sheet of 1 m held along 1 m: half of that to the last pin, and from there the sheet at the strain
+/// limit of a tenth (m); a millimetre for rounding.
+const EXTENT_MAX: f32 = 0.5 + 1.1 + 0.001;
 
 #[test]
 fn a_hanging_sheet_stretches_by_its_weight_and_no_more() {
@@ -117,7 +127,8 @@ fn a_hanging_sheet_stretches_by_its_weight_and_no_more() {
     let lowest = flag.state.positions.iter().map(|p| p.y).fold(f32::INFINITY, f32::min);
     // w L^2 / (2 Eh) = 0.2 * 9.81 / 2000 m.
     let expected = 0.2 * 9.81 / 2000.0;
-    assert!((1.0 - lowest - expected).abs() < 0.5 * expected, "{lowest}");
+    // Masses lumped at the vertices give the same elongation; a tenth is for swinging that is left.
+    assert!((1.0 - lowest - expected).abs() < 0.1 * expected, "{lowest}");
 }
 
 #[test]
@@ -128,24 +139,36 @@ fn a_swinging_sheet_never_gains_energy_and_keeps_its_size() {
         for (i, p) in flag.state.positions.iter_mut().enumerate() {
             *p = Vec3::new(p.x, 2.0, (i as u32 / n) as f32 / (n - 1) as f32);
         }
-        let mut before = flag.model.energy(&flag.state);
-        let (first, mut lowest) = (before, f32::INFINITY);
+        let first = flag.model.energy(&flag.state);
+        let (mut energy, mut lowest) = (first, f32::INFINITY);
         for step in 0..240 {
             flag.step(DT, Vec3::ZERO, &[]);
-            let energy = flag.model.energy(&flag.state);
-            // What stretched threads give back: 2 % of the sheet's weight times its length.
-            assert!(energy < before + 0.04, "{n} {step}: {before} {energy} J");
-            assert!(flag.stretch() < 0.13, "{n} {step}: {}", flag.stretch());
-            before = energy;
+            energy = flag.model.energy(&flag.state);
+            // It began unstretched and at rest, so motion and height never have more than at first;
+            // 0.1 % of its weight times its length a second for rounding.
+            let rounding = 0.001 * 0.2 * GRAVITY * (step + 1) as f32 * DT;
+            assert!(energy <= first + rounding, "{n} {step}: {first} {energy} J");
             lowest = flag.state.positions.iter().fold(lowest, |l, p| l.min(p.y));
         }
-        assert!(before < first && (0.95..1.1).contains(&lowest), "{n}: lowest point {lowest}");
+        // Its lower edge passes straight below the pins, 1 m, no lower than the strain limit; between
+        // two frames it goes 6.3 m/s * DT at most, so that one of them is this near to the lowest point.
+        let missed = 0.5 * (6.3 * DT).powi(2);
+        assert!(energy < first && (0.9 - 1e-3..=1.0 + missed).contains(&lowest), "{n}: {lowest} m");
     }
 }
 
 #[test]
 fn strong_wind_and_a_shaken_pole_leave_it_bounded_and_it_comes_to_rest() {
     let mut flag = Flag::new(14, Material::default());
+    // The air presses with 0.5 rho Cd w^2 on a metre of cloth that stretches by 1 m per 1000 N/m, the
+    // pole pulls with its mass times 0.15 m (2 pi 5 Hz)^2.
+    let (wind_m_s, shaken_m_s) = (33.6f32, 0.15 * std::f32::consts::TAU * 5.0);
+    let pressure = 0.5 * 1.225 * 1.28 * wind_m_s * wind_m_s;
+    let pull = 0.2 * shaken_m_s * std::f32::consts::TAU * 5.0;
+    let stretch_max = (pressure + pull) / 1000.0;
+    // Nothing drives a point faster than air, pole and a fall from straight up to straight down.
+    let speed_max = wind_m_s + shaken_m_s + (2.0 * GRAVITY * 2.0f32).sqrt();
+    let energy_max = 0.5 * 0.2 * speed_max * speed_max + 0.2 * GRAVITY * (2.0 + EXTENT_MAX);
     for step in 0..600 {
         let t = step as f32 * DT;
         // Four times a strong breeze of 8 m/s, and a pole shaken by 15 cm at 5 Hz.
@@ -155,7 +178,9 @@ fn strong_wind_and_a_shaken_pole_leave_it_bounded_and_it_comes_to_rest() {
             *pin = Vec3::new(i as f32 / 13.0 + sway, 2.0, 0.0);
         }
         assert!(flag.extent() < EXTENT_MAX, "{step}: {}", flag.extent());
-        assert!(flag.stretch() < 0.6, "{step}: {}", flag.stretch());
+        assert!(flag.stretch() < stretch_max, "{step}: {}", flag.stretch());
+        let energy = flag.model.energy(&flag.state);
+        assert!(energy < energy_max, "{step}: {energy} J of {energy_max} J");
     }
     let seconds = flag.rest(25.0);
     assert!(seconds < REST_S, "still moving after {seconds} s");
@@ -174,7 +199,7 @@ fn a_ball_of_thirty_metres_a_second_takes_it_along_not_apart() {
         }
         let seconds = flag.rest(25.0);
         assert!(seconds < REST_S, "{dt}: still moving after {seconds} s");
-        assert!(flag.stretch() < 0.05, "{dt}: {}", flag.stretch());
+        assert!(flag.stretch() < REST_STRETCH, "{dt}: {}", flag.stretch());
     }
 }
 
@@ -197,11 +222,12 @@ fn a_sheet_dropped_on_a_sphere_stays_outside_of_it() {
         model.step(&input, &mut state, &mut workspace).unwrap();
         for p in &state.positions {
             let depth = 0.3 - p.distance(Vec3::new(0.0, 0.5, 0.0));
-            assert!(depth < 0.001 && p.y > 0.0, "{step}: {depth} m deep");
+            // The offset and the expansion are kept, so the sphere itself is never touched.
+            assert!(depth <= 0.0 && p.y > 0.0, "{step}: {depth} m deep");
         }
     }
     let speed = state.velocities.iter().map(|v| v.length()).fold(0.0, f32::max);
-    assert!(speed < 0.3, "it lies still: {speed} m/s");
+    assert!(speed < REST_M_S, "it lies still: {speed} m/s");
 }
 
 #[test]
@@ -234,19 +260,21 @@ fn a_teleport_takes_the_cloth_along() {
     flag.rest(3.0);
     let before = flag.state.clone();
     let far = Vec3::new(100.0, -20.0, 300.0);
+    // A step goes on as it would have: its speed, and what gravity adds if nothing holds it.
+    let speed_max = flag.speed() + GRAVITY * DT;
     flag.pins.iter_mut().for_each(|p| *p += far);
     flag.step(DT, Vec3::ZERO, &[]);
     for (p, old) in flag.state.positions.iter().zip(&before.positions) {
-        assert!((*p - *old - far).length() < 0.02, "{p} {old}");
+        assert!((*p - *old - far).length() < speed_max * DT + 1e-4, "{p} {old}");
     }
-    assert!(flag.speed() < 1.0, "{}", flag.speed());
+    assert!(flag.speed() <= speed_max, "{}", flag.speed());
     // Turned on the spot as well: bounded, and at rest again soon.
     let middle = flag.pins.iter().sum::<Vec3>() / 14.0;
     flag.pins.iter_mut().for_each(|p| *p = middle - (*p - middle));
     flag.step(DT, Vec3::ZERO, &[]);
     assert!(flag.extent() < EXTENT_MAX, "{}", flag.extent());
     let seconds = flag.rest(25.0);
-    assert!(seconds < REST_S && flag.stretch() < 0.05, "{seconds} {}", flag.stretch());
+    assert!(seconds < REST_S && flag.stretch() < REST_STRETCH, "{seconds} {}", flag.stretch());
 }
 
 /// Random wind, shaking, balls, lengths of step and teleports; bounded at every step.
@@ -278,7 +306,7 @@ fn unattended(n: u32, steps: u32) {
         assert!(flag.extent() < EXTENT_MAX && flag.speed() <= 40.001, "{step}: {}", flag.extent());
     }
     let seconds = flag.rest(25.0);
-    assert!(seconds < REST_S && flag.stretch() < 0.05, "{seconds} s, {}", flag.stretch());
+    assert!(seconds < REST_S && flag.stretch() < REST_STRETCH, "{seconds} s, {}", flag.stretch());
 }
 
 #[test]
@@ -345,5 +373,30 @@ fn what_makes_no_sense_is_refused_and_changes_nothing() {
         let refused = flag.model.step(&input, &mut flag.state, &mut flag.workspace);
         assert!(refused.is_err(), "{input:?}");
         assert_eq!(flag.state, before);
+    }
+}
+
+#[test]
+fn a_thin_rod_does_not_slip_between_the_points() {
+    // Points 33 cm apart, a rod of 4 cm through the middle of a cell at 3 m/s: with places along the
+    // edges it takes the sheet along, by its radius at least; without, it goes through.
+    for (spacing_m, takes_along) in [(0.0, false), (0.05, true)] {
+        let mut flag = Flag::new(4, Material::default());
+        let settings = Settings { spacing_m, ..Settings::default() };
+        let pinned: Vec<u32> = (0..4).collect();
+        let environment = Environment::default();
+        flag.model =
+            Coarse::new(sheet(4), Material::default(), environment, &pinned, settings).unwrap();
+        let rod = |step: i32| {
+            let z = -0.3 + 0.05 * step as f32;
+            Capsule { ends: [Vec3::new(-1.0, 1.5, z), Vec3::new(2.0, 1.5, z)], radius: 0.02 }
+        };
+        let mut ahead = 0.0f32;
+        for step in 0..10 {
+            flag.step(DT, Vec3::ZERO, &[Moving { from: rod(step), to: rod(step + 1) }]);
+            let middle = flag.state.positions[5..7].iter().chain(&flag.state.positions[9..11]);
+            ahead = middle.map(|p| p.z).sum::<f32>() / 4.0 - rod(step + 1).ends[0].z;
+        }
+        assert_eq!(ahead > 0.0, takes_along, "{spacing_m}: {ahead} m before the rod");
     }
 }

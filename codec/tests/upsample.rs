@@ -85,6 +85,7 @@ fn sample(bits: u8) -> Parts {
             compression: 0.5,
             damping_per_s: 0.5,
             expansion_m: 0.25,
+            spacing_m: 0.0,
         },
         skins: (0..5)
             .map(|v| Skin { vertex: v, share: WHOLE, binding, rest: grid(FINE)[v as usize] })

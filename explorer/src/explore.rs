@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use object_store::ObjectStore;
+use protocol::manifest::GarmentVersion;
 use protocol::{SigningKey, VersionNumber};
 
 use crate::cpu::CpuClock;
@@ -18,6 +19,7 @@ use crate::grow::record::{PublishRecord, SteerRecord, TagRecord};
 use crate::grow::round::{self, Ended, RoundError};
 use crate::grow::work::{Work, WorkError};
 use crate::pack::publish::codec_of;
+use crate::pack::upsampler::{self, UpsamplerSettings};
 use crate::pack::{Bound, EncodeSettings, Profile, PublishError, Publisher, collect_leftovers};
 use crate::scene::Scene;
 use crate::simulator::{SimulateError, Simulator, SimulatorFactory};
@@ -55,6 +57,9 @@ pub struct ExploreOptions {
     pub codec: Option<Profile>,
     /// What profile `toile` keeps to, for states encoded from now on.
     pub bound: Bound,
+    /// Whether a version after the first gets an upsampler, where the garment has none yet: learned from
+    /// the initial graph. A garment that can have none goes on without.
+    pub upsampler: Option<UpsamplerSettings>,
     /// As in the paper: neither early stop nor re-merging.
     pub paper: bool,
     /// Whether an exploration that ends by `frames` or `error_m` leaves the best prefix as head
@@ -76,6 +81,7 @@ impl Default for ExploreOptions {
             keep_free_bytes: 256 << 20,
             codec: None,
             bound: Bound::LIVE,
+            upsampler: None,
             paper: false,
             best_prefix_at_end: true,
             should_stop: Arc::new(|| false),
@@ -172,7 +178,8 @@ pub async fn explore(
         collect_leftovers(folder)
             .map_err(|source| ExploreError::Leftovers { folder: folder.clone(), source })?;
     }
-    let mut publisher = Garment(publisher, &scene.garment.name, &*place.store);
+    let mut publisher =
+        Garment { publisher, scene, store: &*place.store, upsampler: options.upsampler };
     let folder = place.folder.as_deref();
     let setup = Setup { scene, simulators, work: &place.work, folder, options };
     run(setup, work, &mut publisher, progress).await
@@ -186,6 +193,11 @@ trait Publish {
     /// Makes the graph the head; says its number.
     async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError>;
 
+    /// Whether the head should have an upsampler and has none.
+    fn lacks_upsampler(&self) -> bool {
+        false
+    }
+
     /// What players walked since this batch of telemetry.
     async fn walked(&self, after: u64) -> Result<Walked, object_store::Error>;
 
@@ -193,31 +205,67 @@ trait Publish {
     async fn tagged(&self, after: u64) -> Result<Tagged, object_store::Error>;
 }
 
-/// The store's publisher, for the garment of this name.
-struct Garment<'a>(Publisher, &'a str, &'a dyn ObjectStore);
+/// The store's publisher, for a scene's garment.
+struct Garment<'a> {
+    publisher: Publisher,
+    scene: &'a Scene,
+    store: &'a dyn ObjectStore,
+    /// How to make an upsampler; `None` where none is wanted or can be had.
+    upsampler: Option<UpsamplerSettings>,
+}
+
+impl Garment<'_> {
+    fn listed(&self) -> Option<&GarmentVersion> {
+        self.publisher.head()?.garment(&self.scene.garment.name)
+    }
+
+    /// Gives the next version an upsampler, if it is to have one.
+    fn learn(&mut self, view: &dyn GraphView) -> Result<(), PublishError> {
+        let Some(settings) = self.upsampler.filter(|_| self.lacks_upsampler()) else {
+            return Ok(());
+        };
+        match upsampler::learn(self.scene, view, &settings) {
+            Ok((bytes, learned)) => {
+                tracing::info!(?learned, bytes = bytes.len(), "an upsampler was learned");
+                self.publisher.set_upsampler(bytes)
+            }
+            Err(error) => {
+                tracing::warn!(%error, "published without an upsampler");
+                self.upsampler = None;
+                Ok(())
+            }
+        }
+    }
+}
 
 impl Publish for Garment<'_> {
     fn head(&self) -> (Option<VersionNumber>, u64) {
-        let Some(head) = self.0.head() else { return (None, 0) };
-        let last = head.garment(self.1).and_then(|garment| garment.regions.last());
+        let Some(head) = self.publisher.head() else { return (None, 0) };
+        let last = self.listed().and_then(|garment| garment.regions.last());
         let stored = last.map_or(0, |last| last.first_state.0 + u64::from(last.state_count));
         (Some(head.number), stored)
     }
 
     async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError> {
-        Ok(self.0.publish(view).await?.number)
+        self.learn(view)?;
+        Ok(self.publisher.publish(view).await?.number)
+    }
+
+    fn lacks_upsampler(&self) -> bool {
+        let lacking = self.listed().is_some_and(|garment| garment.upsampler.is_none());
+        lacking && self.upsampler.is_some()
     }
 
     async fn walked(&self, after: u64) -> Result<Walked, object_store::Error> {
-        match self.0.head().and_then(|head| head.garment(self.1)) {
-            Some(garment) => walked_since(self.2, garment.id, after).await,
+        match self.listed() {
+            Some(garment) => walked_since(self.store, garment.id, after).await,
             None => Ok(Walked { newest: after, ..Walked::default() }),
         }
     }
 
     async fn tagged(&self, after: u64) -> Result<Tagged, object_store::Error> {
-        match self.0.head().and_then(|head| head.garment(self.1)) {
-            Some(garment) => tagged_since(self.2, garment.id, after).await,
+        match self.listed() {
+            Some(garment) => tagged_since(self.store, garment.id, after).await,
             None => Ok(Tagged { newest: after, ..Tagged::default() }),
         }
     }
@@ -253,7 +301,8 @@ async fn run(
     let mut simulators: Vec<Box<dyn Simulator>> =
         (0..workers).map(|_| setup.simulators.simulator()).collect();
     // A store that lost versions, or a new one for an old folder, is brought up to date at once.
-    let mut behind = work.ledger().published().is_some_and(|p| head < Some(p.number));
+    let mut behind = work.ledger().published().is_some_and(|p| head < Some(p.number))
+        || publisher.lacks_upsampler();
     let stop = || (options.should_stop)();
     progress(&run.progress(&setup, &work, None));
     loop {
@@ -414,7 +463,8 @@ async fn finish(
     let newest = work.graph().commit();
     let best = work.graph().best_commit().filter(|_| setup.options.best_prefix_at_end);
     let shown = best.unwrap_or(newest);
-    if work.ledger().published().map(|last| last.shown) != Some(shown) {
+    let shows = work.ledger().published().map(|last| last.shown);
+    if shows != Some(shown) || publisher.lacks_upsampler() {
         publish(&mut work, publisher, shown).await?;
     }
     Ok(run.summary(setup, &work, end))

@@ -149,6 +149,7 @@ fn coarse(upsampler: &Upsampler) -> Result<Coarse, UpsampledError> {
         compression: s.compression,
         damping_per_s: s.damping_per_s,
         expansion_m: s.expansion_m,
+        spacing_m: s.spacing_m,
     };
     let mesh = Mesh::new(points, triangles)?;
     Ok(Coarse::new(mesh, material, environment, &pinned, settings)?)

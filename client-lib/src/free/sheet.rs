@@ -84,6 +84,7 @@ pub fn stored() -> Stored {
             compression: 1.0,
             damping_per_s: 4.0,
             expansion_m: 0.0,
+            spacing_m: 0.0,
         },
         skins: (0..FINE).map(skin).collect(),
         modes: vec![],

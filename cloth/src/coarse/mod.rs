@@ -11,6 +11,7 @@
 //! Whatever happens to it, a state stays finite and bounded: speeds are limited, pins that jump take
 //! the cloth along, a pass cannot overshoot, and no point gets further from its pin than cloth reaches.
 
+mod between;
 mod collide;
 mod elastic;
 mod envelope;
@@ -23,6 +24,7 @@ use crate::model::{Environment, State};
 use crate::solver::SPEED_MAX_M_S;
 use crate::solver::bending::Stiffness;
 use crate::solver::matrix::Pattern;
+use between::Sample;
 use collide::Swept;
 pub use collide::{Capsule, Moving};
 use elastic::{Constants, Group};
@@ -58,11 +60,21 @@ pub struct Settings {
     pub damping_per_s: f32,
     /// Added to every collider's radius (m), so that the fine points stay out as well.
     pub expansion_m: f32,
+    /// Besides the points, places along the edges keep off colliders, no further apart than this (m):
+    /// a thin limb does not slip between points. 0: the points alone.
+    pub spacing_m: f32,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { passes: 6, sweeps: 4, compression: 1.0, damping_per_s: 0.5, expansion_m: 0.0 }
+        Self {
+            passes: 6,
+            sweeps: 4,
+            compression: 1.0,
+            damping_per_s: 0.5,
+            expansion_m: 0.0,
+            spacing_m: 0.0,
+        }
     }
 }
 
@@ -86,6 +98,8 @@ pub struct Coarse {
     bending: Stiffness,
     constants: Constants,
     groups: Vec<Group>,
+    /// Places along edges that keep off colliders as well.
+    samples: Vec<Sample>,
     shape: Envelope,
 }
 
@@ -112,6 +126,8 @@ pub struct Workspace {
     factor: Envelope,
     swept: Vec<Swept>,
     near: Vec<[u16; NEAREST]>,
+    /// The same for places along edges.
+    near_between: Vec<[u16; NEAREST]>,
     start: Vec<Vec3A>,
     aim: Vec<Vec3A>,
     x: Vec<Vec3A>,
@@ -138,7 +154,7 @@ pub enum CoarseError {
     /// Settings that make no sense.
     #[error(
         "settings {0:?}: 1..=64 passes, up to 64 sweeps, compression 0..=1, damping 0..=100 a \
-             second, expansion 0..=1 m"
+             second, expansion 0..=1 m, spacing 0 or 0.01..=1 m"
     )]
     Settings(Settings),
     /// A list of another length.
@@ -183,10 +199,13 @@ impl Coarse {
                 return Err(CoarseError::Pinned(*pin));
             }
         }
-        let Settings { passes, sweeps, compression, damping_per_s, expansion_m } = settings;
+        let Settings { passes, sweeps, compression, damping_per_s, expansion_m, spacing_m } =
+            settings;
         let fine =
             (1..=64).contains(&passes) && sweeps <= 64 && (0.0..=100.0).contains(&damping_per_s);
-        if !fine || !(0.0..=1.0).contains(&compression) || !(0.0..=1.0).contains(&expansion_m) {
+        let spaced = spacing_m.to_bits() == 0 || (0.01..=1.0).contains(&spacing_m);
+        let shares = (0.0..=1.0).contains(&compression) && (0.0..=1.0).contains(&expansion_m);
+        if !fine || !shares || !spaced {
             return Err(CoarseError::Settings(settings));
         }
         let pattern = Pattern::new(&mesh);
@@ -198,6 +217,7 @@ impl Coarse {
             bending: Stiffness::new(&mesh, &pattern, material.bend),
             constants: Constants::new(&material, compression),
             groups: Group::all(&mesh),
+            samples: between::samples(&mesh, spacing_m),
             pinned: pinned.to_vec(),
             mesh,
             material,
@@ -262,6 +282,7 @@ impl Coarse {
         for _ in 0..self.settings.sweeps {
             self.shorten(ws);
             self.push_out(ws);
+            self.push_out_between(ws);
         }
         self.hold_leashes(ws);
         self.end(dt, state, ws);
@@ -396,25 +417,13 @@ impl Coarse {
         ws.contacts.clear();
         ws.contacts.resize(self.masses.len(), None);
         for (i, place) in self.places.iter().enumerate() {
-            let mut near = [u16::MAX; NEAREST];
-            let mut distances = [f32::INFINITY; NEAREST];
             let x = ws.start[i];
             // The strain limit and neighbours may carry a point further than its own aim.
             let way = 2.0 * (ws.aim[i] - x).length() + 0.1;
-            for (c, swept) in ws.swept.iter().enumerate() {
-                if *place == usize::MAX || swept.misses(x, way) > 0.0 {
-                    continue;
-                }
-                let distance = swept.distance(x);
-                if distance < distances[0] {
-                    (distances[1], near[1]) = (distances[0], near[0]);
-                    (distances[0], near[0]) = (distance, c as u16);
-                } else if distance < distances[1] {
-                    (distances[1], near[1]) = (distance, c as u16);
-                }
-            }
-            ws.near.push(near);
+            let led = *place == usize::MAX;
+            ws.near.push(if led { [u16::MAX; NEAREST] } else { nearest(&ws.swept, x, way) });
         }
+        self.find_near_between(ws);
     }
 
     /// One pass: true forces, constant matrix.
@@ -508,6 +517,25 @@ impl Coarse {
             state.velocities[i] = (way / dt).clamp_length_max(SPEED_MAX_M_S).into();
         }
     }
+}
+
+/// The colliders nearest to `x` that something within `way` of it may meet (m), nearest first.
+fn nearest(colliders: &[Swept], x: Vec3A, way: f32) -> [u16; NEAREST] {
+    let mut near = [u16::MAX; NEAREST];
+    let mut distances = [f32::INFINITY; NEAREST];
+    for (c, swept) in colliders.iter().enumerate() {
+        if swept.misses(x, way) > 0.0 {
+            continue;
+        }
+        let distance = swept.distance(x);
+        if distance < distances[0] {
+            (distances[1], near[1]) = (distances[0], near[0]);
+            (distances[0], near[0]) = (distance, c as u16);
+        } else if distance < distances[1] {
+            (distances[1], near[1]) = (distance, c as u16);
+        }
+    }
+    near
 }
 
 /// Places of free points in the solve's order, and the order itself.

@@ -5,7 +5,7 @@
 //! middle of that box, and the middle times the row's true sum of weights is added back in f32, so
 //! that a cloth far from the origin loses nothing. The f32 form is the reference, at twice the bytes.
 
-use super::memory::with_huge_pages;
+use super::memory::{Huge, with_huge_pages};
 use super::pairs::{Chunk, Entry, Pair, Sums, packed};
 use super::{PANEL_ROWS, Set};
 use crate::ROWS_MAX;
@@ -30,7 +30,7 @@ pub struct Operator {
 #[derive(Debug, Clone)]
 enum Weights {
     /// Panel after panel pairs of columns; what a weight of 1 stands for, a row.
-    Whole { chunks: Vec<Chunk<i16>>, units: Vec<f32> },
+    Whole { chunks: Huge<Chunk<i16>>, units: Vec<f32> },
     /// Panel after panel the columns.
     Float(Vec<Sums>),
 }
@@ -144,7 +144,7 @@ impl Operator {
             }
         }
         let panels = fine.div_ceil(PANEL_ROWS);
-        let mut chunks = with_huge_pages(panels * coarse.div_ceil(2));
+        let mut chunks = Vec::with_capacity(panels * coarse.div_ceil(2));
         for panel in 0..panels {
             for pair in 0..coarse.div_ceil(2) {
                 let mut chunk = Chunk([0i16; 2 * PANEL_ROWS]);
@@ -157,6 +157,7 @@ impl Operator {
                 chunks.push(chunk);
             }
         }
+        let chunks = Huge::new(&chunks, Chunk([0i16; 2 * PANEL_ROWS]));
         Ok(Self { fine, coarse, row_sums, weights: Weights::Whole { chunks, units } })
     }
 
@@ -258,10 +259,17 @@ impl Operator {
         for ((chunks, fine), (units, row_sums)) in panels.zip(rows) {
             let mut sums = [Sums([0.0; PANEL_ROWS]); 3];
             i16::add(set, chunks, &pairs[..count], &factors, &mut sums);
-            for (row, fine) in fine.chunks_exact_mut(3).enumerate() {
-                for (axis, fine) in fine.iter_mut().enumerate() {
-                    *fine = sums[axis].0[row] * units[row] + middle[axis] * row_sums[row];
+            for (sums, middle) in sums.iter_mut().zip(middle) {
+                let rows = units.iter().zip(row_sums);
+                for (sum, (unit, row_sum)) in sums.0.iter_mut().zip(rows) {
+                    *sum = *sum * unit + middle * row_sum;
                 }
+            }
+            let [x, y, z] = &sums;
+            let (points, _) = fine.as_chunks_mut::<3>();
+            let axes = x.0.iter().zip(&y.0).zip(&z.0);
+            for (point, ((x, y), z)) in points.iter_mut().zip(axes) {
+                *point = [*x, *y, *z];
             }
         }
     }

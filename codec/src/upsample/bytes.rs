@@ -134,8 +134,7 @@ impl Parts {
         let s = &self.stepping;
         out.extend([s.steps, s.passes, s.sweeps, u8::from(s.ground)]);
         floats(out, &[s.compression, s.damping_per_s, s.expansion_m]);
-        floats(out, &[self.rms_m, self.max_m]);
-        out.extend([0; 4]);
+        floats(out, &[self.rms_m, self.max_m, s.spacing_m]);
         assert_eq!(out.len(), HEADER_BYTES);
     }
 
@@ -180,11 +179,9 @@ impl Parts {
     }
 
     fn take(counts: &Counts, at: &mut Bytes<'_>) -> Result<Self, UpsampleError> {
-        let (fabric, stepping) = (at.fabric(), at.stepping()?);
-        let [rms_m, max_m] = at.floats();
-        if at.take() != [0; 4] {
-            return Err(UpsampleError::Invalid { what: "header byte", index: HEADER_BYTES - 4 });
-        }
+        let (fabric, mut stepping) = (at.fabric(), at.stepping()?);
+        let [rms_m, max_m, spacing_m] = at.floats();
+        stepping.spacing_m = spacing_m;
         let points = at.list(counts.coarse, Bytes::floats);
         let places = at.list(counts.coarse, |at| Place {
             vertices: std::array::from_fn(|_| at.long()),
@@ -294,7 +291,17 @@ impl Bytes<'_> {
         }
         let [compression, damping_per_s, expansion_m] = self.floats();
         let ground = ground == 1;
-        Ok(Stepping { steps, passes, sweeps, ground, compression, damping_per_s, expansion_m })
+        let spacing_m = 0.0;
+        Ok(Stepping {
+            steps,
+            passes,
+            sweeps,
+            ground,
+            compression,
+            damping_per_s,
+            expansion_m,
+            spacing_m,
+        })
     }
 
     fn classes(&mut self, counts: &Counts) -> Result<Vec<Class>, UpsampleError> {

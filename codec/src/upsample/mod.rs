@@ -154,6 +154,9 @@ pub struct Stepping {
     pub damping_per_s: f32,
     /// Added to every radius (m).
     pub expansion_m: f32,
+    /// Places along coarse edges keep off capsules as well, no further apart than this (m); 0: points
+    /// alone.
+    pub spacing_m: f32,
 }
 
 /// Everything that is stored of an upsampler.
@@ -322,7 +325,8 @@ impl Parts {
         let counts = (1..=8).contains(&s.steps) && (1..=64).contains(&s.passes) && s.sweeps <= 64;
         let numbers = (0.0..=1.0).contains(&s.compression)
             && (0.0..=100.0).contains(&s.damping_per_s)
-            && (0.0..=1.0).contains(&s.expansion_m);
+            && (0.0..=1.0).contains(&s.expansion_m)
+            && (0.0..=1.0).contains(&s.spacing_m);
         let f = &self.fabric;
         let weft = f.weft.unwrap_or(f.stretch);
         let fabric = [f.density, f.stretch, weft, f.shear, f.bend, f.friction, f.drag]

@@ -2,7 +2,7 @@
 //!
 //! Map: [`basis`] streaming SVD; [`design`] from a bound to rank and steps; [`encode`] regions and
 //! their true error; [`publish`] versions;
-//! [`mod@inspect`] what a store holds; [`scene_chunk`] a scene as clients get it; [`store`] reading
+//! [`upsampler`] what cloth leaves the graph with; [`mod@inspect`] what a store holds; [`scene_chunk`] a scene as clients get it; [`store`] reading
 //! and writing; [`key`] who signs.
 //!
 //! Absent on purpose: who is connected, and any clock: equal views and equal history make equal
@@ -23,6 +23,7 @@ mod regions;
 pub mod scene_chunk;
 mod statistics;
 pub mod store;
+pub mod upsampler;
 mod wide;
 
 pub use design::Bound;
