@@ -209,6 +209,10 @@ pub struct Play {
     /// Write a contact sheet.
     #[arg(long, value_name = "FILE.png")]
     pub picture: Option<PathBuf>,
+    /// Frames on the contact sheet.
+    #[arg(long, default_value_t = crate::record::SHOTS, requires = "picture",
+          value_parser = clap::value_parser!(u64).range(1..=400))]
+    pub shots: u64,
     /// One JSON object on the last line of stdout.
     #[arg(long)]
     pub json: bool,

@@ -44,7 +44,7 @@ pub fn run(a: args::Explore) -> Result<()> {
     let mut live = Live::new(a.frames);
     let mut told = false;
     let mut version = None;
-    let summary = explore_blocking(&scene, &named, &opened, work, &options, &mut |progress| {
+    let summary = explore_blocking(&scene, &named, &opened, &work, &options, &mut |progress| {
         if let Some(failure) = &progress.failure {
             live.note(&format!("a job was given up: {failure}"));
         }
@@ -72,7 +72,7 @@ pub fn explore_blocking(
     scene: &Scene,
     named: &Named,
     opened: &Opened,
-    work: std::path::PathBuf,
+    work: &std::path::Path,
     options: &ExploreOptions,
     progress: &mut dyn FnMut(&Progress),
 ) -> Result<Summary> {
@@ -88,14 +88,22 @@ pub fn explore_blocking(
             work.display()
         );
     }
-    std::fs::create_dir_all(&work)
+    std::fs::create_dir_all(work)
         .with_context(|| format!("the work folder {} cannot be made", work.display()))?;
-    named.leave(&work)?;
     let key = explorer::pack::load_or_make_key(&key_file)?;
     let simulators = simulators(scene).context("setting up the simulation")?;
     let (store, folder) = (Arc::clone(&opened.store), opened.folder.clone());
-    let place = Place { store, folder, key, work };
-    Ok(runtime.block_on(explore(scene, &*simulators, &place, options, progress))?)
+    let place = Place { store, folder, key, work: work.to_owned() };
+    // Only once the folder is known to be of this scene: a slip must not spoil what it says.
+    let mut left = None;
+    let mut told = |now: &Progress| {
+        left.get_or_insert_with(|| named.leave(work));
+        progress(now);
+    };
+    let summary = runtime.block_on(explore(scene, &*simulators, &place, options, &mut told))?;
+    left.unwrap_or(Ok(()))?;
+    named.leave(work)?;
+    Ok(summary)
 }
 
 /// What the run will cost, by what a frame cost so far.

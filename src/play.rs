@@ -49,7 +49,7 @@ struct Summary {
 /// Plays a walk and prints what was shown.
 pub fn run(a: &args::Play) -> Result<()> {
     let spec = WalkSpec::parse(&a.walk)?;
-    let mut recorder = Recorder::new(a.export.clone(), a.picture.clone(), a.frames)?;
+    let mut recorder = Recorder::new(a.export.clone(), a.picture.clone(), a.frames, a.shots)?;
     let client = Client::connect(ClientConfig {
         fingerprint: a.fingerprint.clone(),
         token: a.token.clone(),

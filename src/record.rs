@@ -11,7 +11,7 @@ use picture::glb::{Clip, ClipMesh};
 use picture::{Camera, Layer, Paint, Sheet, View};
 
 /// Pictures of a contact sheet.
-const SHOTS: u64 = 40;
+pub const SHOTS: u64 = 40;
 const SHEET_COLUMNS: u32 = 8;
 /// Under cloth the body is drawn this much thinner than it was simulated against (m). Merging, blending and
 /// lossy coding move cloth by more than the gap that contact keeps, and skin that pokes through by
@@ -27,6 +27,7 @@ pub struct Recorder {
     export: Option<PathBuf>,
     picture: Option<PathBuf>,
     frames: u64,
+    shots: u64,
     played: u64,
     body: Vec<Vec<Vec3>>,
     cloth: Vec<Vec<Vec3>>,
@@ -60,8 +61,14 @@ pub struct Meshes<'a> {
 }
 
 impl Recorder {
-    /// Refuses files that could not be written, before anything is played.
-    pub fn new(export: Option<PathBuf>, picture: Option<PathBuf>, frames: u64) -> Result<Self> {
+    /// Refuses files that could not be written, before anything is played. `shots` frames, evenly spaced,
+    /// are drawn.
+    pub fn new(
+        export: Option<PathBuf>,
+        picture: Option<PathBuf>,
+        frames: u64,
+        shots: u64,
+    ) -> Result<Self> {
         for file in [&export, &picture].into_iter().flatten() {
             place::ensure_writable(file)?;
         }
@@ -72,7 +79,7 @@ impl Recorder {
         );
         let sheet = Sheet::new(SHEET_COLUMNS);
         let (body, cloth, joints) = (Vec::new(), Vec::new(), Vec::new());
-        Ok(Self { export, picture, frames, played: 0, body, cloth, sheet, joints })
+        Ok(Self { export, picture, frames, shots, played: 0, body, cloth, sheet, joints })
     }
 
     /// Takes a frame: the character, and its cloth in the world.
@@ -99,7 +106,7 @@ impl Recorder {
 
     /// Whether the frame counted last is drawn.
     fn shoots(&self) -> bool {
-        let (number, shots) = (self.played - 1, SHOTS.min(self.frames));
+        let (number, shots) = (self.played - 1, self.shots.min(self.frames));
         self.picture.is_some() && (number * shots) % self.frames < shots
     }
 

@@ -15,7 +15,7 @@ use serde::Serialize;
 use self::table::Table;
 use crate::explore::Stop;
 use crate::live::Live;
-use crate::record::{Meshes, Recorder, Shown};
+use crate::record::{Meshes, Recorder, SHOTS, Shown};
 use crate::{args, format, scene};
 
 /// Frames where the user does not say.
@@ -48,7 +48,7 @@ pub fn run(a: &args::Simulate) -> Result<()> {
         return converge::run(a, &spec);
     }
     let frames = a.frames.unwrap_or(if a.soak { SOAK_FRAMES } else { FRAMES });
-    let recorder = Recorder::new(a.export.clone(), a.picture.clone(), frames)?;
+    let recorder = Recorder::new(a.export.clone(), a.picture.clone(), frames, SHOTS)?;
     let table = a.table.clone().map(Table::new).transpose()?;
     let mut scene = scene::load_with(&a.scene, a.vertices)?;
     start_at_clip(&mut scene, &spec);

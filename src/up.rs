@@ -115,7 +115,7 @@ impl Explorer {
         let progress = Arc::new(Mutex::new(None));
         let shared = Arc::clone(&progress);
         let body = move || {
-            explore_blocking(&scene, &named, &opened, work, &options, &mut |now| {
+            explore_blocking(&scene, &named, &opened, &work, &options, &mut |now| {
                 *shared.lock().unwrap_or_else(PoisonError::into_inner) = Some(now.clone());
             })
         };

@@ -128,3 +128,16 @@ fn merges_are_certified_replayed_drawn_and_compared() {
     assert!(rows.iter().any(|row| row["what"] == "floor" && row["horizon_s"] == 0.5));
     assert_eq!(rows[0]["what"], "graph");
 }
+
+#[test]
+fn another_scene_named_by_mistake_changes_nothing() {
+    let store = shared_store();
+    let left = || std::fs::read_to_string(format!("{}.work/scene.json", path(store))).unwrap();
+    let before = left();
+    let other = ["--scene", "robe", "--vertices", "1600", "--frames", "1"];
+    let said = toile_error(&[&["explore", "--store", path(store)], &other[..]].concat());
+    assert!(said.contains("made for other inputs"), "{said}");
+    assert_eq!(left(), before);
+    let said = toile_error(&["scene", "check", "rope"]);
+    assert!(said.contains("\"rope\"") && said.contains("robe, dress"), "{said}");
+}

@@ -74,6 +74,9 @@ pub enum SceneError {
         /// Why.
         source: std::io::Error,
     },
+    /// Neither a scene that is built in nor a file.
+    #[error("there is no scene {name:?}: name a TOML file, or one of robe{list}", name = .0, list = shipped())]
+    Unknown(String),
     /// The scene file itself.
     #[error("{}: {source}", path.display())]
     File {
@@ -125,6 +128,11 @@ pub enum SceneError {
         /// What is wrong.
         source: GarmentError,
     },
+}
+
+/// The names of the scenes that are shipped, after a comma each.
+fn shipped() -> String {
+    SHIPPED.iter().map(|(name, _)| format!(", {name}")).collect()
 }
 
 /// A scene, and what was dropped on the way to it.
@@ -229,6 +237,9 @@ fn scene_text(name_or_path: &str) -> Result<(String, PathBuf), SceneError> {
         return Ok(((*text).to_owned(), PathBuf::from(format!("scenes/{name}.toml"))));
     }
     let path = PathBuf::from(name_or_path);
+    if path.extension().is_none() && !path.exists() {
+        return Err(SceneError::Unknown(name_or_path.to_owned()));
+    }
     let text = String::from_utf8(read(&path, "the command line")?).map_err(|_| {
         let source = SceneFileError::Toml("is not UTF-8 text; give a TOML file".to_owned());
         SceneError::File { path: path.clone(), source }
