@@ -13,6 +13,8 @@ const SWEEPS: u32 = 40;
 const ROUNDS: u32 = 24;
 /// Times the pairs are listed again because something moved further than foreseen.
 const LISTINGS: u32 = 4;
+/// Share of the way that lets pairs be listed again from which a vertex's pairs are among them.
+const LITTLE: f32 = 0.2;
 /// What a push asks for, against what must be kept.
 const GENEROUS: f32 = 2.0;
 
@@ -64,11 +66,16 @@ impl SelfContact {
     /// Whether a vertex ends so far from where it was foreseen that unlisted pairs might meet.
     fn has_strayed(&mut self, model: &Model, x: &[Vec3A], ends: &[Vec3A]) -> bool {
         let most = 0.5 * (Self::reach(model) - FLOOR_M);
-        let foreseen = x.iter().zip(&self.listed).map(|(x, way)| *x + *way);
-        let far = |(e, f): (&Vec3A, Vec3A)| e.distance_squared(f) > most * most;
+        let foreseen = || x.iter().zip(&self.listed).map(|(x, way)| *x + *way);
+        let off = |(e, f): (&Vec3A, Vec3A), most: f32| e.distance_squared(f) > most * most;
+        if !ends.iter().zip(foreseen()).any(|pair| off(pair, most)) {
+            return false;
+        }
+        // What is a little off is listed again as well: it may have folded meanwhile.
+        let little = |pair: (&Vec3A, Vec3A)| off(pair, LITTLE * most);
         self.strayed.clear();
-        self.strayed.extend(ends.iter().zip(foreseen).map(far));
-        self.strayed.contains(&true)
+        self.strayed.extend(ends.iter().zip(foreseen()).map(little));
+        true
     }
 
     /// Gauss-Seidel over the pairs that would meet, in turn with the edges that this stretches too
