@@ -31,6 +31,7 @@ use clap::Parser;
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
+    end_where_nobody_reads();
     start_log(arguments.verbose);
     let done = match arguments.command {
         Command::Up(a) => up::run(&a),
@@ -58,6 +59,19 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// A reader that closes the pipe early, as `head` does, wants no more: that is no fault to report.
+fn end_where_nobody_reads() {
+    let report = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        let said = panic.payload_as_str().unwrap_or_default();
+        if said.starts_with("failed printing to") && said.contains("Broken pipe") {
+            // As a program ends that SIGPIPE ends.
+            std::process::exit(141);
+        }
+        report(panic);
+    }));
 }
 
 /// The error and its causes, without those that the sentence before them says already.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::run::{Serving, path, shared_store, toile_error, toile_json};
+use crate::run::{Serving, command, path, shared_store, toile_error, toile_json};
 
 #[test]
 fn an_explored_store_is_total_and_its_figures_add_up() {
@@ -140,4 +140,19 @@ fn another_scene_named_by_mistake_changes_nothing() {
     assert_eq!(left(), before);
     let said = toile_error(&["scene", "check", "rope"]);
     assert!(said.contains("\"rope\"") && said.contains("robe, dress"), "{said}");
+}
+
+#[test]
+fn a_reader_that_goes_away_is_no_panic() {
+    let mut child = command(&["scene", "check", "robe"])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let mut said = String::new();
+    let mut stderr = child.stderr.take().unwrap();
+    std::io::Read::read_to_string(&mut stderr, &mut said).unwrap();
+    assert!(!child.wait().unwrap().success());
+    assert_eq!(said, "");
 }
