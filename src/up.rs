@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, anyhow};
 use client_lib::ClientConfig;
 use explorer::explore::{ExploreOptions, Progress, Summary};
+use explorer::pack::upsampler::UpsamplerSettings;
 use explorer::scene::Scene;
 use loadtest::{Players, PlayersConfig, Totals};
 use serde::Serialize;
@@ -70,6 +71,7 @@ pub fn run(a: &args::Up) -> Result<()> {
         bound: place::bound(a.bound_mm)?,
         workers: place::workers(a.workers)?,
         policy: a.policy,
+        upsampler: Some(UpsamplerSettings::default()),
         best_prefix_at_end: false,
         should_stop: stop.asked(),
         ..ExploreOptions::default()

@@ -4,6 +4,7 @@
 //! quantised to 16 bits, and draws them.
 
 mod actor;
+mod air;
 pub mod answers;
 mod app;
 mod dial;

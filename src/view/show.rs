@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::actor::{Actor, Blending, Still};
+use super::air::{self, Air};
 use super::answers;
 use super::app::App;
 use super::dial;
@@ -48,6 +49,11 @@ pub enum Command {
         /// Of the scene's own speed, 0 to 2.
         times: f32,
     },
+    /// Let a wind blow.
+    Wind {
+        /// Metres a second.
+        m_s: f32,
+    },
     /// Leave out columns as far as this error allows.
     Dial {
         /// Millimetres.
@@ -83,6 +89,8 @@ pub enum Command {
 pub struct Pane {
     /// Skin the cloth to the body instead.
     plain: bool,
+    /// Outside the graph, by coarse simulation and upsampling alone.
+    coarse: bool,
     /// A version by number; none: the current one.
     version: Option<u64>,
     /// Columns of the basis; none: as the dial says.
@@ -115,6 +123,7 @@ pub struct Show {
     fixed_columns: Vec<Option<usize>>,
     curve: Vec<dial::Point>,
     dial_mm: f32,
+    air: Air,
     clock: Clock,
     writer: FrameWriter,
     figures: Figures,
@@ -176,6 +185,7 @@ impl Show {
             fixed_columns: Vec::new(),
             curve: Vec::new(),
             dial_mm: 0.0,
+            air: Air::default(),
             clock,
             writer: FrameWriter::default(),
             figures: Figures { seed, ..Figures::default() },
@@ -223,6 +233,10 @@ impl Show {
             Command::Speed { times } => {
                 ensure!((0.0..=2.0).contains(&times), "a speed from 0 to 2");
                 self.clock.speed = f64::from(times);
+            }
+            Command::Wind { m_s } => {
+                ensure!(m_s >= 0.0, "metres a second, at least 0");
+                self.air.set(m_s);
             }
             Command::Dial { mm } => {
                 ensure!(mm >= 0.0, "millimetres, at least 0");
@@ -295,6 +309,7 @@ impl Show {
 
     fn tick(&mut self) {
         let Some(steering) = &mut self.steering else { return };
+        self.air.blow(&mut self.actors);
         match &mut self.mode {
             Mode::Play | Mode::Compare(_) => {
                 let next = steering.next(self.actors[0].character.pose());
@@ -407,6 +422,7 @@ impl Show {
                 actor.be_plain()?;
             }
             actor.character.join(&self.actors[0].character);
+            actor.character.stay_outside(pane.coarse);
             actors.push(actor);
         }
         self.actors = actors;
@@ -510,7 +526,7 @@ impl Show {
             "goal": self.steering.as_ref().and_then(Steering::goal),
             "answers": self.steering.as_ref().map(Steering::answers),
             "exact": figures.steps[0], "substituted": figures.steps[1],
-            "missed": figures.steps[2],
+            "missed": figures.steps[2], "outside": air::told(lead),
             "shown_mm": lead.shown_error_m() * 1e3,
             "passed": std::mem::take(&mut figures.passed),
             "bytes_received": status.bytes_received,

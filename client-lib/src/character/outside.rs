@@ -82,6 +82,12 @@ impl Character {
         room
     }
 
+    /// Leaves the graph at the next step and stays outside, in a calm too; `false`, as at first: as
+    /// forces and merges have it.
+    pub fn stay_outside(&mut self, stay: bool) {
+        self.free.forces.stay = stay;
+    }
+
     /// Leaves the graph rather than play a merge whose error (m) is above this; `None`, as at first:
     /// plays every merge.
     pub fn leave_above(&mut self, error_m: Option<f32>) {

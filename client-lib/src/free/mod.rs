@@ -167,18 +167,20 @@ fn transform(rigid: &Rigid) -> Transform {
 pub(crate) struct Forces {
     /// Velocity of the air in the world (m/s).
     pub(crate) wind: Vec3,
+    /// The host wants it outside whatever acts.
+    pub(crate) stay: bool,
     pub(crate) pushes: Vec<Push>,
 }
 
 impl Default for Forces {
     fn default() -> Self {
-        Self { wind: Vec3::ZERO, pushes: Vec::with_capacity(PUSHES_MAX) }
+        Self { wind: Vec3::ZERO, stay: false, pushes: Vec::with_capacity(PUSHES_MAX) }
     }
 }
 
 impl Forces {
     pub(crate) fn act(&self) -> bool {
-        self.wind != Vec3::ZERO || !self.pushes.is_empty()
+        self.stay || self.wind != Vec3::ZERO || !self.pushes.is_empty()
     }
 
     /// A frame has passed.

@@ -15,7 +15,7 @@ function made(name, text, props = {}) {
 // What may be shown in a pane of a comparison.
 const PANE_CHOICES = {
   show: [["the cloth", {}], ["plain skinning", { plain: true }], ["first graph", { version: 1 }],
-    ["older version", { older: true }]],
+    ["older version", { older: true }], ["coarse + upsampling", { coarse: true }]],
   columns: [["rank: dial", {}], ["rank 10", { columns: 10 }], ["rank 50", { columns: 50 }],
     ["full rank", { columns: 65536 }]],
   blend: [["blend: linear", { blend: "linear" }], ["blend: off", { blend: "off" }],
@@ -54,6 +54,7 @@ class Panels {
       });
     }
     at("dial").addEventListener("input", () => this.dial());
+    at("wind").addEventListener("input", () => this.blow());
     at("speed").addEventListener("input", () => {
       const times = Number(at("speed").value);
       at("sped").value = times === 1 ? "1" : times.toFixed(2);
@@ -85,6 +86,13 @@ class Panels {
   again() {
     if (this.chosen) this.send(this.chosen);
     this.dial();
+    this.blow();
+  }
+
+  blow() {
+    const speed = Number(at("wind").value);
+    at("blown").textContent = speed ? `${speed} m/s` : "calm";
+    this.send({ do: "wind", m_s: speed });
   }
 
   inspect(dead) {
@@ -272,6 +280,16 @@ class Panels {
     this.takeAnswers(said.answers);
     this.takeTags(said.tags || []);
     this.takeCost(said, pageMs);
+    this.takeOutside(said.outside);
+  }
+
+  // Where the wind has taken the cloth: in the graph, or outside of it.
+  takeOutside({ can_leave, frames, nearest_mm, total }) {
+    at("wind").disabled = !can_leave;
+    const far = nearest_mm === null ? "" : `, nearest state ${nearest_mm.toFixed(0)} mm away`;
+    let text = "in the graph" + (total ? `; ${whole.format(total)} frames outside so far` : "");
+    if (frames !== null) text = `outside the graph for ${whole.format(frames)} frames${far}`;
+    at("outside").textContent = can_leave ? text : "no upsampler in this version: no wind";
   }
 
   takeAnswers(answers) {

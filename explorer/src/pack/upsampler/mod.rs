@@ -142,7 +142,7 @@ pub fn learn(
         places: coarse.vertices.iter().map(|v| place(*v)).collect(),
         pins: pins.collect(),
         capsules: capsules(scene, &data, &coarse.vertices, &bound),
-        fabric: fabric(scene),
+        fabric: fabric(scene, &mesh),
         stepping: stepping(scene),
         skins: skins(scene, &bound),
         modes: Vec::new(),
@@ -227,14 +227,19 @@ fn skins(scene: &Scene, bound: &bind::Bound) -> Vec<Skin> {
     (0..bound.shares.len()).map(skin).filter(|skin| skin.share > 0).collect()
 }
 
-fn fabric(scene: &Scene) -> Fabric {
+/// The garment's own, but for bending: a fold that the coarse mesh cannot resolve must not form, so that
+/// cloth of its edges' length stands against its own weight (bending length = edge).
+fn fabric(scene: &Scene, mesh: &Mesh) -> Fabric {
     let f = &scene.garment.fabric;
+    let edges = mesh.rest_lengths();
+    let edge_m = edges.iter().sum::<f32>() / edges.len().max(1) as f32;
+    let resolved = f.density * 9.81 * edge_m.powi(3);
     Fabric {
         density: f.density,
         stretch: f.stretch,
         weft: f.weft,
         shear: f.shear,
-        bend: f.bend,
+        bend: f.bend.max(resolved.min(1.0)),
         friction: f.friction,
         drag: f.drag,
         damping_s: f.damping_s,
@@ -246,7 +251,7 @@ fn fabric(scene: &Scene) -> Fabric {
 fn stepping(scene: &Scene) -> Stepping {
     Stepping {
         steps: 2,
-        passes: 12,
+        passes: 20,
         sweeps: 4,
         ground: scene.exploration.ground,
         compression: 0.3,
