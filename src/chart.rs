@@ -13,6 +13,8 @@ use crate::{args, codec};
 const LEAST_BYTES: f64 = 1.0;
 /// and no error at all (mm).
 const LEAST_MM: f64 = 0.1;
+/// The cheap end: a mesh that its skin carries.
+const SKINNING: &str = "plain-skinning";
 /// The dear end: exact, without a byte, at a price in time.
 const SIMULATION: &str = "full-simulation";
 /// Pixels to a unit of the PNG files.
@@ -126,24 +128,35 @@ fn plot(
     let mut plot = Plot::new(&title, x_label, y_label).logarithmic().logarithmic_along();
     plot.size = [760, 440];
     let tier = |p: &Point| p.name.contains("-tier");
-    let families: [(&str, &str, bool); 6] = [
-        ("plain skinning", "plain-skinning", false),
+    let families: [(&str, &str, bool); 4] = [
         ("kim2013, rank 50 to 400", "kim2013", false),
         ("toile, by bound", "toile", false),
         ("toile, tiers of 16 to 128 columns", "toile", true),
         ("meshopt + zstd", "meshopt", false),
-        ("full simulation", SIMULATION, false),
     ];
     let place = |p: &Point| [x(p), y(p).max(LEAST_MM)];
-    for (family, prefix, tiers) in families {
+    // Simulating at run time has no place among bytes: it would beat all of them.
+    let rivals = points.iter().filter(|p| p.name != SIMULATION || x_label.starts_with("ms"));
+    let plot = plot.with("Pareto line", pareto(rivals.map(place)));
+    let plot = families.into_iter().fold(plot, |plot, (family, prefix, tiers)| {
         let of_family = points.iter().filter(|p| p.name.starts_with(prefix) && tier(p) == tiers);
         let mut curve: Vec<[f64; 2]> = of_family.map(place).collect();
         curve.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        plot = plot.with(family, curve);
-    }
-    // Simulating at run time has no place among bytes: it would beat all of them.
-    let rivals = points.iter().filter(|p| p.name != SIMULATION || x_label.starts_with("ms"));
-    plot.with("Pareto line", pareto(rivals.map(place)))
+        if let [only] = curve[..] {
+            curve = diamond(only).to_vec();
+        }
+        plot.with(family, curve)
+    });
+    let ends = points.iter().filter(|p| [SKINNING, SIMULATION].contains(&p.name.as_str()));
+    // A gap between the two.
+    let ends = ends.flat_map(|p| diamond(place(p)).into_iter().chain([[f64::NAN; 2]]));
+    plot.with("ends: plain skinning, full simulation", ends.collect())
+}
+
+/// A lone point, to be seen.
+fn diamond([x, y]: [f64; 2]) -> [[f64; 2]; 5] {
+    let (left, right, down, up) = (x / 1.06, x * 1.06, y / 1.06, y * 1.06);
+    [[left, y], [x, up], [right, y], [x, down], [left, y]]
 }
 
 /// Points that no other beats in both, as stairs.
