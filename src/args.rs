@@ -51,7 +51,9 @@ pub enum Command {
     Lab(Lab),
     /// Measure the codec.
     Codec(Codec),
-    /// Draw bytes and milliseconds per frame against error, for every codec.
+    /// Learn what a coarse simulation lacks, and measure it (Kavan et al. 2011).
+    Upsample(crate::upsample::Upsample),
+    /// Draw bytes and milliseconds per frame against error, for every codec or way of upsampling.
     Chart(Chart),
 }
 
@@ -420,8 +422,8 @@ pub enum SceneCommand {
 /// `toile chart`.
 #[derive(Debug, Args)]
 pub struct Chart {
-    /// Object store: a folder or a URL.
-    #[arg(value_name = "STORE")]
+    /// Object store (a folder or a URL), or flag, curtain, skirt or cape.
+    #[arg(value_name = "STORE|SCENE")]
     pub store: String,
     /// Where to write the files.
     #[arg(long, value_name = "DIR")]

@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use picture::Plot;
 use serde_json::Value;
 
-use crate::{args, codec};
+use crate::{args, codec, upsample};
 
 /// Where no bytes at all are drawn on a logarithmic axis,
 const LEAST_BYTES: f64 = 1.0;
@@ -33,6 +33,9 @@ struct Point {
 
 /// Measures, or reads what was measured, and draws.
 pub fn run(a: &args::Chart) -> Result<()> {
+    if explorer::upsample::scene::NAMES.contains(&a.store.as_str()) {
+        return upsample::chart(&a.store, a);
+    }
     let start = Instant::now();
     std::fs::create_dir_all(&a.out)
         .with_context(|| format!("the folder {} cannot be made", a.out.display()))?;

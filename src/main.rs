@@ -22,6 +22,7 @@ mod serve;
 mod simulate;
 mod store;
 mod up;
+mod upsample;
 mod view;
 
 use std::process::ExitCode;
@@ -45,6 +46,7 @@ fn main() -> ExitCode {
         Command::Simulate(a) => simulate::run(&a),
         Command::Scene(a) => scene::run(a),
         Command::Lab(a) => lab::run(a),
+        Command::Upsample(a) => upsample::run(&a),
         Command::Chart(a) => chart::run(&a),
         Command::Codec(a) => match a.command {
             args::CodecCommand::DecodeBench(a) => decode_bench::run(&a),

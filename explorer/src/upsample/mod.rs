@@ -4,14 +4,26 @@
 //! Map: [`scene`] the paper's four scenes; [`figure`] the character with its capsules; [`patch`]
 //! coarse and fine meshes of one surface, barycentric lift and Loop subdivision; [`harmonics`] the
 //! smoothest functions of a mesh; [`run`] tracked simulation; [`cache`] results in the work
-//! folder.
+//! folder; [`data`] frames as matrices; [`fit`] the paper's operators; [`tune`] their parameters;
+//! [`modes`] oscillatory modes; [`beyond`] what the paper leaves open; [`judge`] errors; [`learn`] a
+//! scene from its name to an operator; [`report`] all methods side by side.
 
+pub mod beyond;
 pub mod cache;
+pub mod data;
 pub mod figure;
+pub mod fit;
 pub mod harmonics;
+pub mod judge;
+pub mod learn;
+pub mod modes;
 pub mod patch;
+pub mod report;
 pub mod run;
 pub mod scene;
+pub mod tune;
+
+pub use learn::{Learned, learn};
 
 use cache::{Cache, Key};
 use cloth::Mesh;

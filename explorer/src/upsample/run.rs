@@ -1,5 +1,7 @@
 //! Training data: a coarse simulation, and a fine one that is tracked by it.
 
+use std::time::Instant;
+
 use cloth::coarse::{self, Coarse, CoarseError, Input, Moving};
 use cloth::solver::track::{Guide, TrackError, Tracker, step_tracked};
 use cloth::{Model, ModelError, State, Vec3, Workspace};
@@ -108,6 +110,26 @@ impl<'a> Simulation<'a> {
     /// # Errors
     /// Surroundings out of range.
     pub fn run_coarse(&self, motion: &Motion) -> Result<Vec<Vec<Vec3>>, CoarseError> {
+        self.step_coarse(motion, &mut |_| ())
+    }
+
+    /// Median time of a coarse step of a motion (us).
+    ///
+    /// # Errors
+    /// Surroundings out of range.
+    pub fn time_coarse(&self, motion: &Motion) -> Result<f64, CoarseError> {
+        let mut times = Vec::new();
+        self.step_coarse(motion, &mut |s| times.push(s))?;
+        times.sort_by(f64::total_cmp);
+        Ok(1e6 * times[times.len() / 2])
+    }
+
+    /// `timed` is told how long each step took (s).
+    fn step_coarse(
+        &self,
+        motion: &Motion,
+        timed: &mut dyn FnMut(f64),
+    ) -> Result<Vec<Vec<Vec3>>, CoarseError> {
         let mut state = self.coarse.rest_state();
         let mut ws = coarse::Workspace::default();
         let rest = self.scene.coarse.mesh.rest_positions();
@@ -125,7 +147,9 @@ impl<'a> Simulation<'a> {
                 push: &[],
                 seconds: self.scene.frame_s,
             };
+            let start = Instant::now();
             self.coarse.step(&input, &mut state, &mut ws)?;
+            timed(start.elapsed().as_secs_f64());
             frames.push(state.positions.clone());
             before = now;
         }

@@ -1,0 +1,464 @@
+//! `toile upsample report`: every method on every motion of a scene, and what they cost.
+
+use std::time::Instant;
+
+use codec::kernel::operator::Operator;
+use faer::{Mat, MatRef};
+use serde::Serialize;
+
+use super::beyond::{self, Blend};
+use super::data::{Frames, narrow};
+use super::fit::{Profile, Training};
+use super::judge::{Errors, Judge};
+use super::learn::{LearnError, Lesson};
+use super::modes::{Mode, with_modes};
+use super::patch;
+use crate::cpu::CpuClock;
+
+/// Calls of the operator that are timed, with its weights in cache and out of it.
+const CALLS: [usize; 2] = [200, 15];
+/// Ways of going beyond the paper.
+const BEYOND: [&str; 4] = ["harmonic-lift", "sparse", "history", "blended"];
+/// Read between two calls so that nothing of the operator is left in a cache (bytes).
+const EVICT_BYTES: usize = 128 << 20;
+
+/// What a scene came to.
+#[derive(Debug, Clone, Serialize)]
+pub struct Report {
+    /// Name of the scene.
+    pub scene: &'static str,
+    /// Coarse points.
+    pub m: usize,
+    /// Fine points.
+    pub n: usize,
+    /// Training frames.
+    pub f: usize,
+    /// Test functions of the tracking constraint.
+    pub t: usize,
+    /// Harmonics that the fit uses.
+    pub k: usize,
+    /// Processor time to compute them (s).
+    pub harmonics_s: f64,
+    /// Processor time to learn the harmonic operator from frames in memory (s).
+    pub learn_s: f64,
+    /// Processor time to learn it again after a change of the profile (s).
+    pub refit_s: f64,
+    /// Time of U p with U in cache, in 16 bits (us, median).
+    pub apply_hot_us: f64,
+    /// Time of U p with U in memory (us, median).
+    pub apply_cold_us: f64,
+    /// Time of a coarse step of the training motion (us, median).
+    pub coarse_step_us: f64,
+    /// U as a client holds it, in 16 bits (bytes).
+    pub memory_bytes: usize,
+    /// Largest residual of the tracking constraint in all motions (mm).
+    pub tracking_residual_mm: f64,
+    /// Parameters, tuned on the training motion.
+    pub parameters: Parameters,
+    /// Largest distance of a row's sum from 1.
+    pub partition_of_unity: f64,
+    /// Pairs of oscillatory modes: frequency (Hz) and share explained.
+    pub modes: Vec<[f64; 2]>,
+    /// What rounding of U costs on the training motion.
+    pub rounding: Vec<Rounding>,
+    /// Training motion first.
+    pub motions: Vec<MotionReport>,
+    /// The harmonic operator against one learnt again on the other motions, and operators blended.
+    pub retraining: Vec<Retraining>,
+}
+
+/// Parameters of the methods.
+#[derive(Debug, Clone, Serialize)]
+pub struct Parameters {
+    /// alpha of Tikhonov's.
+    pub tikhonov: f64,
+    /// alpha of the Laplacian's (m^2).
+    pub laplacian: f64,
+    /// gamma_1, gamma_N and c.
+    pub harmonic: [f64; 3],
+    /// The same of the correction of the barycentric lift.
+    pub harmonic_lift: [f64; 3],
+    /// gamma of the sparse operator.
+    pub sparse: f64,
+}
+
+/// What a number of bits costs.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Rounding {
+    /// Bits of a weight.
+    pub bits: u8,
+    /// Root mean square distance from the unrounded operator (mm).
+    pub rms_mm: f64,
+    /// Largest one (mm).
+    pub max_mm: f64,
+}
+
+/// Errors on one motion.
+#[derive(Debug, Clone, Serialize)]
+pub struct MotionReport {
+    /// Its name.
+    pub motion: &'static str,
+    /// Whether operators were learnt from it.
+    pub training: bool,
+    /// Frames.
+    pub frames: usize,
+    /// One a method.
+    pub methods: Vec<MethodReport>,
+}
+
+/// Errors of one method.
+#[derive(Debug, Clone, Serialize)]
+pub struct MethodReport {
+    /// Its name.
+    pub name: &'static str,
+    /// Time to upsample a frame (us, median, weights in cache).
+    pub apply_us: f64,
+    /// Against the fine simulation that was tracked by the same coarse run.
+    #[serde(flatten)]
+    pub errors: Errors,
+}
+
+/// A motion that the operator was not learnt from, against an operator that was learnt from it (Kavan
+/// et al. 2011, Figure 10).
+#[derive(Debug, Clone, Serialize)]
+pub struct Retraining {
+    /// The motion.
+    pub motion: &'static str,
+    /// Root mean square error of the harmonic operator as it is (mm).
+    pub harmonic_rms_mm: f64,
+    /// Of one learnt from this motion with the same profile, on the frames that it was learnt from (mm).
+    pub retrained_rms_mm: f64,
+    /// For each way of going beyond the paper, learnt from the training motion alone, the share of
+    /// the gap between both that it closes; over 1 where it is better than learning again.
+    pub gap_closed: Vec<Closed>,
+}
+
+/// How much of a gap a method closes.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Closed {
+    /// The method.
+    pub name: &'static str,
+    /// Share of the gap.
+    pub share: f64,
+}
+
+/// What turns coarse positions into fine ones.
+pub enum Method {
+    /// A matrix.
+    Linear(Mat<f32>),
+    /// A matrix over positions and their changes.
+    History(Mat<f32>),
+    /// A matrix, then modes along the normals.
+    Modes(Mat<f32>, Vec<Mode>),
+    /// Matrices blended by state.
+    Blended(Blend),
+}
+
+/// All methods of a scene.
+pub struct Methods {
+    /// By name.
+    pub all: Vec<(&'static str, Method)>,
+    /// Their parameters.
+    pub parameters: Parameters,
+    /// Processor time to learn the harmonic operator, and to learn it again with another profile (s).
+    pub seconds: [f64; 2],
+}
+
+impl Lesson {
+    /// Fine positions that a method gives for frames.
+    pub fn upsample(&self, method: &Method, frames: &Frames) -> Mat<f32> {
+        let positions = || narrow(frames.coarse.as_ref());
+        match method {
+            Method::Linear(operator) => operator * positions(),
+            Method::History(operator) => operator * narrow(frames.with_history().coarse.as_ref()),
+            Method::Modes(operator, modes) => {
+                let triangles = self.scene.fine.mesh.triangles();
+                with_modes(&(operator * positions()), modes, triangles)
+            }
+            Method::Blended(blend) => blend.apply(&self.scene.coarse.mesh, frames),
+        }
+    }
+
+    /// All methods, learnt from the training motion alone.
+    ///
+    /// # Errors
+    /// A fit without a solution.
+    pub fn methods(&self) -> Result<Methods, LearnError> {
+        let frames = self.training();
+        let (harmonics, k) = (&self.harmonics, self.k);
+        let table = self.table(frames)?;
+        let (alpha, stiff) = (table.tikhonov(), table.laplacian(harmonics));
+        let profile = table.profile();
+        let clock = CpuClock::start();
+        let training = Training::new(frames, harmonics, k)?;
+        let learnt = clock.elapsed_s();
+        let clock = CpuClock::start();
+        let harmonic = training.harmonic(&profile);
+        let refit = clock.elapsed_s();
+        let prior = self.barycentric();
+        let rest = frames.without(prior.as_ref());
+        let lift_profile = self.table(&rest)?.profile();
+        let corrected = beyond::corrected(frames, prior.as_ref(), harmonics, k, &lift_profile)?;
+        let history =
+            beyond::corrected(&frames.with_history(), prior.as_ref(), harmonics, k, &lift_profile)?;
+        let gamma = self.tune_sparse(prior.as_ref())?;
+        let sparse = beyond::sparse(frames, prior.as_ref(), &self.supports(), gamma)?;
+        let both = (prior.as_ref(), 3);
+        let blend =
+            Blend::learn(frames, &self.scene.coarse.mesh, both, (harmonics, k), &lift_profile)?;
+        let modes = self.modes(&harmonic);
+        let parameters = Parameters {
+            tikhonov: alpha,
+            laplacian: stiff,
+            harmonic: [profile.first, profile.last, profile.exponent],
+            harmonic_lift: [lift_profile.first, lift_profile.last, lift_profile.exponent],
+            sparse: gamma,
+        };
+        let methods = vec![
+            ("barycentric", Method::Linear(prior)),
+            ("loop", Method::Linear(self.subdivision())),
+            ("none", Method::Linear(training.tikhonov(0.0)?)),
+            ("tikhonov", Method::Linear(training.tikhonov(alpha)?)),
+            ("laplacian", Method::Linear(training.laplacian(&self.laplacian(), stiff)?)),
+            ("harmonic", Method::Linear(harmonic.clone())),
+            ("harmonic-modes", Method::Modes(harmonic, modes)),
+            ("harmonic-lift", Method::Linear(corrected)),
+            ("sparse", Method::Linear(sparse)),
+            ("history", Method::History(history)),
+            ("blended", Method::Blended(blend)),
+        ];
+        Ok(Methods { all: methods, parameters, seconds: [learnt + refit, refit] })
+    }
+
+    /// The whole report.
+    ///
+    /// # Errors
+    /// A fit without a solution, an operator that cannot be rounded.
+    pub fn report(&self) -> Result<Report, LearnError> {
+        let Methods { all: methods, parameters, seconds: [learn_s, refit_s] } = self.methods()?;
+        let judge = Judge::new(&self.harmonics, self.scene.coarse.count());
+        let linear = |name: &str| {
+            methods.iter().find_map(|(n, m)| match m {
+                Method::Linear(operator) if *n == name => Some(operator),
+                _ => None,
+            })
+        };
+        let harmonic = linear("harmonic").ok_or(LearnError::NoOperator)?;
+        let modes = methods.iter().find_map(|(_, m)| match m {
+            Method::Modes(_, modes) => Some(modes.as_slice()),
+            _ => None,
+        });
+        let cost = self.cost(harmonic)?;
+        let [first, last, exponent] = parameters.harmonic;
+        let profile = Profile { first, last, exponent };
+        let motions = self.judge_all(&judge, &methods)?;
+        let hertz = |m: &Mode| m.theta / std::f64::consts::TAU / f64::from(self.scene.frame_s);
+        Ok(Report {
+            scene: self.scene.name,
+            m: self.scene.coarse.count(),
+            n: self.scene.fine.count(),
+            f: self.training().count(),
+            t: self.scene.tests,
+            k: self.k,
+            harmonics_s: self.time_harmonics()?,
+            learn_s,
+            refit_s,
+            apply_hot_us: cost.0,
+            apply_cold_us: cost.1,
+            coarse_step_us: self.coarse_step_us,
+            memory_bytes: cost.2,
+            tracking_residual_mm: 1e3 * self.residual_m,
+            parameters,
+            partition_of_unity: unity(harmonic.as_ref()),
+            modes: modes.unwrap_or_default().iter().map(|m| [hertz(m), m.explained]).collect(),
+            rounding: self.rounding(harmonic)?,
+            retraining: self.retraining(&judge, &profile, &motions)?,
+            motions,
+        })
+    }
+
+    fn judge_all(
+        &self,
+        judge: &Judge,
+        methods: &[(&'static str, Method)],
+    ) -> Result<Vec<MotionReport>, LearnError> {
+        let times: Result<Vec<f64>, LearnError> =
+            methods.iter().map(|(_, method)| self.time(method)).collect();
+        let times = times?;
+        let one = |(at, frames): (usize, &Frames)| MotionReport {
+            motion: self.scene.motions[at].name,
+            training: at == 0,
+            frames: frames.count(),
+            methods: methods
+                .iter()
+                .zip(&times)
+                .map(|((name, method), apply_us)| {
+                    let upsampled = self.upsample(method, frames);
+                    let errors = judge.judge(upsampled.as_ref(), frames.fine.as_ref());
+                    MethodReport { name, apply_us: *apply_us, errors }
+                })
+                .collect(),
+        };
+        Ok(self.frames.iter().enumerate().map(one).collect())
+    }
+
+    /// Median time of a method on a frame (us), as a game would apply it: what has few weights a row
+    /// as a sparse matrix, what is dense in 16 bits.
+    fn time(&self, method: &Method) -> Result<f64, LearnError> {
+        match method {
+            Method::Linear(operator) => {
+                let rows: Vec<Vec<(usize, f32)>> = (0..operator.nrows())
+                    .map(|i| {
+                        let all = (0..operator.ncols()).map(|j| (j, operator[(i, j)]));
+                        all.filter(|(_, w)| *w != 0.0).collect()
+                    })
+                    .collect();
+                if 2 * rows.iter().map(Vec::len).sum::<usize>()
+                    > operator.nrows() * operator.ncols()
+                {
+                    return Ok(self.cost(operator)?.0);
+                }
+                Ok(median(|| {
+                    let frame = &self.training().coarse;
+                    let point = |j: usize| [0, 1, 2].map(|a| frame[(j, a)] as f32);
+                    let points: Vec<[f32; 3]> = (0..operator.ncols()).map(point).collect();
+                    let sum = |row: &Vec<(usize, f32)>| {
+                        row.iter().fold([0.0f32; 3], |mut sum, (j, w)| {
+                            (0..3).for_each(|a| sum[a] += w * points[*j][a]);
+                            sum
+                        })
+                    };
+                    rows.iter().map(sum).collect::<Vec<[f32; 3]>>()
+                }))
+            }
+            Method::History(operator) => Ok(self.cost(operator)?.0),
+            Method::Modes(operator, modes) => {
+                let frame = operator * narrow(self.training().part(0, 1).coarse.as_ref());
+                let triangles = self.scene.fine.mesh.triangles();
+                Ok(self.cost(operator)?.0 + median(|| with_modes(&frame, modes, triangles)))
+            }
+            Method::Blended(blend) => {
+                let mut sum = 0.0;
+                for operator in blend.operators() {
+                    sum += self.cost(operator)?.0;
+                }
+                Ok(sum)
+            }
+        }
+    }
+
+    /// What learning again from each of the other motions would bring, and who comes near it.
+    fn retraining(
+        &self,
+        judge: &Judge,
+        profile: &Profile,
+        motions: &[MotionReport],
+    ) -> Result<Vec<Retraining>, LearnError> {
+        let mut out = Vec::new();
+        for (report, frames) in motions.iter().zip(&self.frames).skip(1) {
+            let again = Training::new(frames, &self.harmonics, self.k)?.harmonic(profile);
+            let upsampled = self.upsample(&Method::Linear(again), frames);
+            let new = judge.judge(upsampled.as_ref(), frames.fine.as_ref()).rms_mm;
+            let rms = |name: &str| {
+                let found = report.methods.iter().find(|m| m.name == name);
+                found.map_or(f64::NAN, |m| m.errors.rms_mm)
+            };
+            let old = rms("harmonic");
+            let close = |name| Closed { name, share: (old - rms(name)) / (old - new) };
+            out.push(Retraining {
+                motion: report.motion,
+                harmonic_rms_mm: old,
+                retrained_rms_mm: new,
+                gap_closed: BEYOND.map(close).into(),
+            });
+        }
+        Ok(out)
+    }
+
+    /// Time of U p hot and cold (us), and its bytes.
+    fn cost(&self, operator: &Mat<f32>) -> Result<(f64, f64, usize), LearnError> {
+        let weights = rows(operator.as_ref());
+        let packed = Operator::quantised(operator.nrows(), operator.ncols(), &weights)?;
+        let frames = self.training();
+        let coarse: Vec<f32> = (0..operator.ncols())
+            .flat_map(|i| (0..3).map(move |a| (i % frames.points, a)))
+            .map(|(i, a)| frames.coarse[(i, a)] as f32)
+            .collect();
+        let mut fine = vec![0.0; 3 * operator.nrows()];
+        let other = vec![1u64; EVICT_BYTES / 8];
+        let mut medians = [0.0; 2];
+        for (cold, median) in medians.iter_mut().enumerate() {
+            let mut times = Vec::new();
+            for _ in 0..CALLS[cold] {
+                if cold == 1 {
+                    std::hint::black_box(other.iter().sum::<u64>());
+                }
+                let start = Instant::now();
+                packed.apply(&coarse, &mut fine)?;
+                times.push(start.elapsed().as_secs_f64());
+            }
+            times.sort_by(f64::total_cmp);
+            *median = 1e6 * times[times.len() / 2];
+        }
+        Ok((medians[0], medians[1], packed.resident_bytes()))
+    }
+
+    fn rounding(&self, operator: &Mat<f32>) -> Result<Vec<Rounding>, LearnError> {
+        let positions = narrow(self.training().coarse.as_ref());
+        let exact = operator * &positions;
+        let mut out = Vec::new();
+        for bits in [12, 13, 14, 16] {
+            let (m, n) = (operator.ncols(), operator.nrows());
+            let packed = codec::upsample::Weights::round(m, &rows(operator.as_ref()), bits)?;
+            let rounded =
+                Mat::from_fn(n, m, |i, j| f32::from(packed.steps[i * m + j]) * packed.units[i]);
+            let off = rounded * &positions - &exact;
+            let (mut sum, mut most) = (0.0f64, 0.0f64);
+            for c in (0..off.ncols()).step_by(3) {
+                for i in 0..n {
+                    let square: f64 = (c..c + 3).map(|c| f64::from(off[(i, c)]).powi(2)).sum();
+                    sum += square;
+                    most = most.max(square);
+                }
+            }
+            let rms_mm = 1e3 * (sum / (n * off.ncols() / 3) as f64).sqrt();
+            out.push(Rounding { bits, rms_mm, max_mm: 1e3 * most.sqrt() });
+        }
+        Ok(out)
+    }
+
+    /// The barycentric lift as a matrix.
+    pub fn barycentric(&self) -> Mat<f32> {
+        let lift = self.scene.coarse.lift(&self.scene.fine);
+        matrix(&patch::dense(&lift, self.scene.coarse.count()), self.scene.coarse.count())
+    }
+}
+
+/// Median time of a call (us).
+fn median<T>(mut call: impl FnMut() -> T) -> f64 {
+    let one = |_| {
+        let start = Instant::now();
+        std::hint::black_box(call());
+        1e6 * start.elapsed().as_secs_f64()
+    };
+    let mut times: Vec<f64> = (0..CALLS[0]).map(one).collect();
+    times.sort_by(f64::total_cmp);
+    times[times.len() / 2]
+}
+
+/// Row after row.
+pub fn rows(operator: MatRef<'_, f32>) -> Vec<f32> {
+    let (n, m) = (operator.nrows(), operator.ncols());
+    (0..n * m).map(|at| operator[(at / m, at % m)]).collect()
+}
+
+/// From row after row of `m` numbers.
+pub fn matrix(rows: &[f32], m: usize) -> Mat<f32> {
+    Mat::from_fn(rows.len() / m, m, |i, j| rows[i * m + j])
+}
+
+/// Largest distance of a row's sum from 1.
+fn unity(operator: MatRef<'_, f32>) -> f64 {
+    let sum = |i: usize| (0..operator.ncols()).map(|j| f64::from(operator[(i, j)])).sum::<f64>();
+    (0..operator.nrows()).map(|i| (sum(i) - 1.0).abs()).fold(0.0, f64::max)
+}
