@@ -67,7 +67,7 @@ fn main() -> ExitCode {
 fn end_where_nobody_reads() {
     let report = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
-        let said = panic.payload_as_str().unwrap_or_default();
+        let said = panic.payload().downcast_ref::<String>().map_or("", String::as_str);
         if said.starts_with("failed printing to") && said.contains("Broken pipe") {
             // As a program ends that SIGPIPE ends.
             std::process::exit(141);
