@@ -29,6 +29,10 @@ impl Air {
         let speed = self.wind_m_s * (1.0 + 0.2 * turn.sin());
         let aside = 0.3 * self.wind_m_s * (0.37 * turn).sin();
         for actor in actors {
+            // Back as soon as a state is as near as the graph's worst merge: whoever moves the slider
+            // back wants the graph back, and that blend is on the page as it is.
+            let worst_m = actor.character.version().listing().stats.worst_error_m;
+            actor.character.return_within(Some(worst_m));
             actor.character.set_wind([speed, 0.0, aside]);
         }
     }
