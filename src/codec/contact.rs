@@ -289,7 +289,9 @@ mod tests {
             (0..=BEFORE).map(|k| vec![1.0 + 0.03 * (k as f32 - BEFORE as f32), 0.0, 0.0]).collect();
         let target = vec![vec![0.0; 3]; BLEND_FRAMES + 3];
         let shown = play(&before, &target, mode, moving);
-        assert_eq!(shown[BEFORE], before[BEFORE], "the dead end itself comes first");
+        if mode != BlendMode::Off {
+            assert_eq!(shown[BEFORE], before[BEFORE], "the dead end itself comes first");
+        }
         assert_eq!(shown.last(), target.last());
         offsets(&shown, &target)
     }
