@@ -304,6 +304,9 @@ mod tests {
         let smooth = jump(BlendMode::Smooth, false);
         let inertialised = jump(BlendMode::Smooth, true);
         assert!((linear - 0.13).abs() < 1e-4, "{linear}");
-        assert!(inertialised < smooth && smooth < linear && linear < none);
+        assert!(inertialised < linear && smooth < linear && linear < none);
+        // At the merge itself, where the others bend at once.
+        let first = |mode, moving| acceleration(&shown(mode, moving)[..3], 1.0);
+        assert!(first(BlendMode::Smooth, true) < 0.5 * first(BlendMode::Smooth, false));
     }
 }
