@@ -65,7 +65,7 @@ impl SelfContact {
     pub(crate) fn find_tangles(&mut self, model: &Model, x: &[Vec3A]) {
         self.positions.clear();
         self.positions.extend(x.iter().map(|p| Vec3::from(*p)));
-        crossings::find(&model.tree, &mut self.fit, &self.positions, false, &mut self.crossings);
+        crossings::find(&model.tree, &mut self.fit, &self.positions, true, &mut self.crossings);
     }
 
     /// Whether the cloth crossed itself when it was looked at last.
