@@ -110,6 +110,21 @@ impl Laplacian {
         out
     }
 
+    /// The lowest `k` pairs of V^-1/2 C V^-1/2 without iterating over subspaces: where these would be
+    /// nearly the whole space.
+    fn dense(&self, roots: &[f64], k: usize) -> Result<Pairs, HarmonicsError> {
+        let n = roots.len();
+        let mut matrix = Mat::<f64>::zeros(n, n);
+        for (a, b, value) in &self.entries {
+            matrix[(*a, *b)] = value / (roots[*a] * roots[*b]);
+        }
+        let eigen = matrix
+            .self_adjoint_eigen(Side::Lower)
+            .map_err(|_| HarmonicsError::Numerical("solved for its eigenvalues"))?;
+        let values = (0..k).map(|j| eigen.S()[j].max(0.0)).collect();
+        Ok((values, eigen.U().subcols(0, k).to_owned()))
+    }
+
     /// Cholesky factors of `C + shift V`.
     fn factored(&self, shift: f64) -> Result<Llt<usize, f64>, HarmonicsError> {
         let n = self.areas.len();
@@ -137,12 +152,14 @@ pub fn harmonics(mesh: &Mesh, k: usize) -> Result<Harmonics, HarmonicsError> {
     let area: f64 = laplacian.areas.iter().sum();
     // Well below the first eigenvalue that is not 0, of the order of 10 / area.
     let shift = 1.0 / area;
-    let process = Lanczos {
-        factor: laplacian.factored(shift)?,
-        roots: laplacian.areas.iter().map(|a| a.sqrt()).collect(),
+    let roots: Vec<f64> = laplacian.areas.iter().map(|a| a.sqrt()).collect();
+    let (eigenvalues, vectors) = if 4 * k + 8 * BLOCK >= n {
+        laplacian.dense(&roots, k)?
+    } else {
+        let process = Lanczos { factor: laplacian.factored(shift)?, roots };
+        let (inverses, vectors) = process.lowest(k)?;
+        (inverses.iter().map(|i| (1.0 / i - shift).max(0.0)).collect(), vectors)
     };
-    let (inverses, vectors) = process.lowest(k)?;
-    let eigenvalues = inverses.iter().map(|i| (1.0 / i - shift).max(0.0)).collect();
     let mean = area / n as f64;
     let mut functions = vec![0.0; n * k];
     for j in 0..k {
