@@ -1,7 +1,7 @@
 //! Cloth outside the graph: coarse simulation and a learned upsampler, where a host applies a force
 //! that no graph has seen (Kavan et al. 2011; their run time).
 //!
-//! [`Upsampled`] is made once of a version's chunk, off the frame loop; [`run`] steps it once a frame;
+//! [`Upsampled`] is made once of a version's chunk, off the frame loop; `run` steps it once a frame;
 //! [`probe`] finds the state of the graph to which it comes back. Nothing here waits, reads or
 //! writes, and a warm frame allocates nothing.
 

@@ -2,10 +2,10 @@
 //! to the linear operator that lifts one to the other.
 //!
 //! Map: [`scene`] the paper's four scenes; [`figure`] the character with its capsules; [`patch`]
-//! coarse and fine meshes of one surface, barycentric lift and Loop subdivision; [`harmonics`] the
+//! coarse and fine meshes of one surface, barycentric lift and Loop subdivision; [`mod@harmonics`] the
 //! smoothest functions of a mesh; [`run`] tracked simulation; [`cache`] results in the work
 //! folder; [`data`] frames as matrices; [`fit`] the paper's operators; [`tune`] their parameters;
-//! [`modes`] oscillatory modes; [`beyond`] what the paper leaves open; [`judge`] errors; [`learn`] a
+//! [`modes`] oscillatory modes; [`beyond`] what the paper leaves open; [`judge`] errors; [`mod@learn`] a
 //! scene from its name to an operator; [`report`] all methods side by side.
 
 pub mod beyond;

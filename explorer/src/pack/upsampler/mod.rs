@@ -1,10 +1,10 @@
 //! An upsampler for a garment of a graph: what clients leave the graph with.
 //!
-//! The coarse mesh is the garment's own, decimated ([`coarsen`]), so a coarse point is a vertex and
+//! The coarse mesh is the garment's own, decimated (`coarsen`), so a coarse point is a vertex and
 //! any state of the graph is a pair of coarse and fine positions: the graph's initial states are the
 //! training data, as exact as any tracked simulation. U is fitted under the partition of unity and
-//! drawn to the barycentric lift ([`fit`]); what follows the body closely, as the states tell, is left
-//! to skinning ([`bind`]; Kavan et al. 2011, section 6).
+//! drawn to the barycentric lift (`fit`); what follows the body closely, as the states tell, is left
+//! to skinning (`bind`; Kavan et al. 2011, section 6).
 
 mod bind;
 mod coarsen;
