@@ -145,7 +145,10 @@ impl ClothSimulator {
                 }
             };
             let crossings = frame.quality.crossings;
-            let is_new = crossings > 0 && crossings > self.crossings_of(state);
+            // Where cloth may pass through itself by the scene's wish, that is no fault.
+            let is_new = self.scene.exploration.self_contact
+                && crossings > 0
+                && crossings > self.crossings_of(state);
             let fault = Fault::of(&frame.quality, body_speed_m_s)
                 .or(is_new.then_some(Fault::Crossings(crossings)));
             frame.quality.frames_retried = u64::from(attempt > 0);
