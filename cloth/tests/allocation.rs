@@ -1,42 +1,10 @@
 //! No allocation per step once warm: a frame that has been simulated before asks for no memory.
-#![allow(unsafe_code)] // an allocator that counts
 
 mod common;
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
+use allocation_counter::measure;
 use cloth::{Environment, Material, Model, Span, Vec3, Workspace, step};
 use common::{ellipsoids, pose_at, sheet};
-
-struct Counting;
-
-thread_local! {
-    static COUNT: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: everything is passed on to the system's allocator.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = COUNT.try_with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's promise is passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: as above.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        let _ = COUNT.try_with(|count| count.set(count.get() + 1));
-        // SAFETY: as above.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
-
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
 
 #[test]
 fn a_warm_workspace_asks_for_no_memory() {
@@ -54,9 +22,10 @@ fn a_warm_workspace_asks_for_no_memory() {
             let at = |f: u32| pose_at(&body, start + Vec3::Z * (0.4 * f as f32 / 30.0));
             let (from, to) = (at(frame), at(frame + 1));
             let span = Span { motion: Some((&from, &to)), seconds: 1.0 / 30.0, refine: 1 };
-            let before = COUNT.get();
-            step(&model, &span, &mut state, &mut ws).unwrap();
-            count += COUNT.get() - before;
+            let asked = measure(|| {
+                step(&model, &span, &mut state, &mut ws).unwrap();
+            });
+            count += asked.count_total;
         }
         count
     };

@@ -3,35 +3,11 @@
 //!
 //! Every threshold is derived from the scene, never from what the solver did: see the constants.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
+use allocation_counter::measure;
 use cloth::coarse::{Capsule, Coarse, CoarseError, Input, Moving, Settings, Workspace};
 use cloth::{Environment, Material, Mesh, State, Vec3};
 use rand_core::Rng;
 use rand_pcg::Pcg64Mcg;
-
-/// Counts the allocations of each thread.
-struct Counting;
-
-thread_local!(static ALLOCATIONS: Cell<usize> = const { Cell::new(0) });
-
-#[allow(unsafe_code)] // a global allocator cannot be written otherwise
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|a| a.set(a.get() + 1));
-        // SAFETY: the caller's promises are the system's.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: as above.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
 
 const DT: f32 = 1.0 / 60.0;
 const GRAVITY: f32 = 9.81;
@@ -335,11 +311,12 @@ fn equal_inputs_give_equal_bits_and_nothing_is_allocated() {
         flag.workspace = workspace;
         let ball = Moving::resting(Capsule::sphere(Vec3::new(0.4, 1.3, 0.05), 0.2));
         flag.step(DT, Vec3::new(1.0, 0.0, 6.0), &[ball]);
-        let before = ALLOCATIONS.get();
-        for _ in 0..50 {
-            flag.step(DT, Vec3::new(1.0, 0.0, 6.0), &[ball]);
-        }
-        assert_eq!(ALLOCATIONS.get(), before, "allocations per step");
+        let asked = measure(|| {
+            for _ in 0..50 {
+                flag.step(DT, Vec3::new(1.0, 0.0, 6.0), &[ball]);
+            }
+        });
+        assert_eq!(asked.count_total, 0, "allocations in 50 steps");
         assert_eq!(flag.n, 9);
         flag.state
     };

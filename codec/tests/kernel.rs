@@ -1,10 +1,9 @@
 //! The kernels: every instruction set gives the scalar twin's bits, integer sums are exact whatever
 //! the entries and coefficients, parts equal the whole, and nothing is allocated per frame.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::sync::Arc;
 
+use allocation_counter::measure;
 use codec::Basis;
 use codec::kernel::normals::Faces;
 use codec::kernel::operator::{Operator, OperatorError, quantise_row};
@@ -12,28 +11,6 @@ use codec::kernel::{Batch, Column, Entries, Panels, PanelsError, Select, Set, de
 use proptest::prelude::*;
 use rand_core::Rng;
 use rand_pcg::Pcg64Mcg;
-
-/// Counts the allocations of each thread.
-struct Counting;
-
-thread_local!(static ALLOCATIONS: Cell<usize> = const { Cell::new(0) });
-
-#[allow(unsafe_code)] // a global allocator cannot be written otherwise
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|a| a.set(a.get() + 1));
-        // SAFETY: the caller's promises are the system's.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: as above.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
 
 /// Numbers in -1..1, the same on every machine.
 fn noise(seed: u64, count: usize) -> Vec<f32> {
@@ -333,7 +310,5 @@ fn nothing_is_allocated_per_frame() {
         faces.normals(&fine, &mut normals).unwrap();
     };
     frame();
-    let before = ALLOCATIONS.get();
-    frame();
-    assert_eq!(ALLOCATIONS.get(), before);
+    assert_eq!(measure(frame).count_total, 0);
 }

@@ -1,8 +1,6 @@
 //! The stored upsampler: golden bytes, hostile bytes, what rounding costs, and one frame of it.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
+use allocation_counter::measure;
 use codec::kernel::Set;
 use codec::kernel::normals::Faces;
 use codec::upsample::{
@@ -10,28 +8,6 @@ use codec::upsample::{
     UpsampleError, Upsampler, WHOLE, Weights, Workspace,
 };
 use proptest::prelude::*;
-
-/// Counts the allocations of each thread.
-struct Counting;
-
-thread_local!(static ALLOCATIONS: Cell<usize> = const { Cell::new(0) });
-
-#[allow(unsafe_code)] // a global allocator cannot be written otherwise
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|a| a.set(a.get() + 1));
-        // SAFETY: the caller's promises are the system's.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: as above.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
 
 /// Two by two coarse points, and five by five fine ones that lie bilinearly between them.
 const FINE: usize = 5;
@@ -281,9 +257,8 @@ fn a_warm_frame_allocates_nothing_and_all_sets_agree() {
         upsampler.pins(&joints, &mut pins);
     };
     step();
-    let before = ALLOCATIONS.get();
-    (0..20).for_each(|_| step());
-    assert_eq!(ALLOCATIONS.get(), before, "allocations a frame");
+    let asked = measure(|| (0..20).for_each(|_| step()));
+    assert_eq!(asked.count_total, 0, "allocations in 20 frames");
 }
 
 proptest! {

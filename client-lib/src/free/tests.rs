@@ -1,7 +1,6 @@
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::sync::Arc;
 
+use allocation_counter::measure;
 use cloth::Vec3;
 use protocol::PoseId;
 
@@ -11,28 +10,6 @@ use crate::character::{Character, StepOutcome, decode};
 use crate::shared::Stage;
 use crate::tiny;
 use crate::version::View;
-
-/// Counts the allocations of each thread.
-struct Counting;
-
-thread_local!(static ALLOCATIONS: Cell<usize> = const { Cell::new(0) });
-
-#[allow(unsafe_code)] // a global allocator cannot be written otherwise
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|a| a.set(a.get() + 1));
-        // SAFETY: the caller's promises are the system's.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: as above.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
 
 const ROWS: usize = 3 * FINE * FINE;
 
@@ -264,8 +241,7 @@ fn a_warm_frame_outside_allocates_nothing() {
     play.push();
     (0..92).for_each(|_| frame(&mut play));
     play.push();
-    let before = ALLOCATIONS.get();
-    (0..25).for_each(|_| frame(&mut play));
-    assert_eq!(ALLOCATIONS.get(), before, "allocations in 25 frames");
+    let asked = measure(|| (0..25).for_each(|_| frame(&mut play)));
+    assert_eq!(asked.count_total, 0, "allocations in 25 frames");
     assert!(play.character.outside().is_some_and(|o| o.nearest_m.is_some()), "the search was on");
 }
