@@ -12,6 +12,10 @@ use crate::mesh::Mesh;
 const NONE: u32 = u32::MAX;
 /// Largest patch that counts as smooth as a whole: too small for its outline to meet itself.
 const PATCH_TRIANGLES: u32 = 32;
+/// In a patch that counts as smooth as a whole, the way within it between two vertices is at most
+/// this much longer than the straight one in the rest shape: a patch with a notch, as between a
+/// sleeve and the chest, can close its notch while all its normals are alike.
+const DETOUR: f32 = 1.3;
 /// Smallest cosine between a smooth patch's normals and their mean.
 const SMOOTH: f32 = 0.4;
 
@@ -114,14 +118,19 @@ impl Tree {
             order,
             corners,
         };
-        tree.whole = tree.slots.iter().map(|range| tree.hangs_together(*range)).collect();
-        tree.find_beside();
+        let rest = mesh.rest_positions();
+        let is_patch = |range: &[u32; 2]| {
+            tree.hangs_together(*range) && !tree.has_notch(rest, [*range, [0; 2]])
+        };
+        let whole = tree.slots.iter().map(is_patch).collect();
+        tree.whole = whole;
+        tree.find_beside(rest);
         tree
     }
 
     /// Lists the patches that share sides, depth by depth. Leaves are opened no further, so they
     /// are met with all that is deeper, too.
-    fn find_beside(&mut self) {
+    fn find_beside(&mut self, rest: &[Vec3]) {
         let mut pairs: Vec<[u32; 2]> = Vec::new();
         let mut level = if self.nodes.is_empty() { Vec::new() } else { vec![0u32] };
         let mut owner = vec![0u32; self.corners.len()];
@@ -149,6 +158,7 @@ impl Tree {
         }
         pairs.sort_unstable();
         pairs.dedup();
+        pairs.retain(|pair| !self.has_notch(rest, pair.map(|n| self.slots[n as usize])));
         self.first_beside = vec![0; self.nodes.len() + 1];
         for [a, _] in &pairs {
             self.first_beside[*a as usize + 1] += 1;
@@ -177,6 +187,48 @@ impl Tree {
             }
         }
         seen.iter().filter(|s| **s).count() == (end - first) as usize
+    }
+
+    /// Whether the way between two vertices within two patches together is a detour.
+    fn has_notch(&self, rest: &[Vec3], ranges: [[u32; 2]; 2]) -> bool {
+        let slots = || ranges.into_iter().flat_map(|[first, end]| first..end);
+        let mut vertices: Vec<u32> = slots().flat_map(|s| self.corners[s as usize]).collect();
+        vertices.sort_unstable();
+        vertices.dedup();
+        let count = vertices.len();
+        // Every vertex of the patch is in the list.
+        let place = |v: u32| vertices.binary_search(&v).unwrap_or(0);
+        let straight = |a: u32, b: u32| rest[a as usize].distance(rest[b as usize]);
+        let mut ways = vec![f32::INFINITY; count * count];
+        for slot in slots() {
+            let corners = self.corners[slot as usize];
+            let inside = |s: &&u32| ranges.iter().any(|[first, end]| (*first..*end).contains(*s));
+            // Along the sides, and straight over them to the next triangle's corner.
+            let beyond = self.across[slot as usize].iter().filter(inside);
+            let far = beyond.flat_map(|s| self.corners[*s as usize]);
+            for to in corners.into_iter().chain(far) {
+                for from in corners {
+                    let (a, b) = (place(from), place(to));
+                    let way = straight(from, to);
+                    ways[a * count + b] = way;
+                    ways[b * count + a] = way;
+                }
+            }
+        }
+        for over in 0..count {
+            for a in 0..count {
+                let first = ways[a * count + over];
+                for b in 0..count {
+                    let way = first + ways[over * count + b];
+                    let known = &mut ways[a * count + b];
+                    *known = known.min(way);
+                }
+            }
+        }
+        (0..count * count).any(|at| {
+            let straight = straight(vertices[at / count], vertices[at % count]);
+            ways[at] > DETOUR * straight && at / count != at % count
+        })
     }
 
     /// Fits the tree to vertices that begin at `at` and go by `way`; no allocation once warm.
@@ -424,4 +476,34 @@ fn edge_of(mesh: &Mesh, a: u32, b: u32) -> usize {
 /// Positions for [`Tree::fit`].
 pub(crate) fn at(positions: &[Vec3]) -> impl Fn(u32) -> Vec3A {
     |v| Vec3A::from(positions[v as usize])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::crossings::find;
+    use crate::lab::shapes::{Cut, sheet};
+
+    /// 30 triangles in a ring of so many radians; the ends lie crosswise.
+    fn ring(angle: f32) -> Mesh {
+        let place = |u: f32, v: f32| {
+            let (turn, out) = (angle * u, 0.1 + 0.02 * v);
+            Vec3::new(out * turn.cos(), out * turn.sin(), 0.01 * (u - 0.5) * (v - 0.5))
+        };
+        sheet(15, 1, Cut::Alternating, place).unwrap()
+    }
+
+    #[test]
+    fn a_flat_patch_whose_ends_meet_is_no_smooth_patch() {
+        let rest = ring(5.5);
+        let closed = ring(6.6);
+        let (tree, mut fit) = (Tree::new(&rest), Fit::default());
+        let (mut smooth, mut all) = (Vec::new(), Vec::new());
+        find(&tree, &mut fit, closed.rest_positions(), true, &mut smooth);
+        find(&tree, &mut fit, closed.rest_positions(), false, &mut all);
+        assert!(!all.is_empty());
+        assert_eq!(smooth, all);
+        let strip = sheet(4, 4, Cut::Alternating, |u, v| Vec3::new(u, v, 0.0)).unwrap();
+        assert!(Tree::new(&strip).whole[0], "a square has no notch");
+    }
 }
