@@ -40,6 +40,7 @@ pub fn run(a: args::Explore) -> Result<()> {
         paper: a.paper,
         best_prefix_at_end: true,
         should_stop: stop.asked(),
+        ..ExploreOptions::default()
     };
     let mut live = Live::new(a.frames);
     let mut told = false;

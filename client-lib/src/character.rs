@@ -24,7 +24,7 @@ mod overlay;
 mod renew;
 mod tier;
 
-pub use decode::decode;
+pub use decode::{Group, decode};
 pub use look::Passed;
 use outside::Free;
 use overlay::Overlay;

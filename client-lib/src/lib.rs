@@ -73,7 +73,7 @@ pub mod walk;
 mod tiny;
 
 pub use blend::BlendMode;
-pub use character::{Character, Passed, StepOutcome, decode};
+pub use character::{Character, Group, Passed, StepOutcome, decode};
 #[cfg(feature = "driver")]
 pub use client::{Client, ClientConfig, ClientError, Status};
 pub use cloth::Rigid;

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use object_store::ObjectStore;
 use protocol::manifest::GarmentVersion;
@@ -16,7 +16,7 @@ use crate::grow::job::{JOB_STATES_MAX, JobError};
 use crate::grow::ledger::Phase;
 use crate::grow::policy::Policy;
 use crate::grow::record::{PublishRecord, SteerRecord, TagRecord};
-use crate::grow::round::{self, Ended, RoundError};
+use crate::grow::round::{self, Ended, Paused, RoundError};
 use crate::grow::work::{Work, WorkError};
 use crate::pack::publish::codec_of;
 use crate::pack::upsampler::{self, UpsamplerSettings};
@@ -65,6 +65,8 @@ pub struct ExploreOptions {
     /// Whether an exploration that ends by `frames` or `error_m` leaves the best prefix as head
     /// (design decision 6). One that is stopped never does.
     pub best_prefix_at_end: bool,
+    /// How often to look for tags while jobs run (each look costs a request to the store).
+    pub tags_every: Duration,
     /// Asked often, also in the middle of a round: true drops the jobs in flight and returns.
     pub should_stop: Arc<dyn Fn() -> bool + Send + Sync>,
 }
@@ -84,6 +86,7 @@ impl Default for ExploreOptions {
             upsampler: None,
             paper: false,
             best_prefix_at_end: true,
+            tags_every: Duration::from_millis(500),
             should_stop: Arc::new(|| false),
         }
     }
@@ -149,7 +152,8 @@ pub struct Place {
 /// 1. drapes the garment on the start pose and simulates every primary edge once;
 /// 2. merges the dead ends and publishes the first version;
 /// 3. for ever: expands the dead ends with the largest errors, round after round, and publishes
-///    at fixed counts of simulated frames.
+///    at fixed counts of simulated frames. What people tag comes first: a round that is under way waits, and a
+///    version follows at once.
 ///
 /// Killed at any instant and called again, it ends with the same work folder and the same store as
 /// if it had not been. The future blocks its thread while it simulates and is not `Send`: give it
@@ -190,8 +194,13 @@ trait Publish {
     /// The head's number, and how many states of this garment the store holds.
     fn head(&self) -> (Option<VersionNumber>, u64);
 
-    /// Makes the graph the head; says its number.
-    async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError>;
+    /// Makes the graph the head; says its number. `soon`: somebody waits, so nothing but the new
+    /// states is worked on.
+    async fn publish(
+        &mut self,
+        view: &dyn GraphView,
+        soon: bool,
+    ) -> Result<VersionNumber, PublishError>;
 
     /// Whether the head should have an upsampler and has none.
     fn lacks_upsampler(&self) -> bool {
@@ -246,7 +255,14 @@ impl Publish for Garment<'_> {
         (Some(head.number), stored)
     }
 
-    async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError> {
+    async fn publish(
+        &mut self,
+        view: &dyn GraphView,
+        soon: bool,
+    ) -> Result<VersionNumber, PublishError> {
+        if soon {
+            return Ok(self.publisher.publish_soon(view).await?.number);
+        }
         self.learn(view)?;
         Ok(self.publisher.publish(view).await?.number)
     }
@@ -304,6 +320,7 @@ async fn run(
     let mut behind = work.ledger().published().is_some_and(|p| head < Some(p.number))
         || publisher.lacks_upsampler();
     let stop = || (options.should_stop)();
+    let mut paused = Paused::default();
     progress(&run.progress(&setup, &work, None));
     loop {
         if work.ledger().round().is_done() {
@@ -331,9 +348,36 @@ async fn run(
         let mut each = |work: &Work, failure: Option<&JobError>| {
             progress(&run.progress(&setup, work, failure));
         };
-        if round::run(&mut work, &mut simulators, &stop, &mut each)? == Ended::Stopped {
-            return Ok(run.summary(&setup, &work, End::Stopped));
+        let tags = looks(&*publisher, work.ledger().newest_tag(), options.tags_every);
+        let asks = (&stop as &dyn Fn() -> bool, tags);
+        let ended = round::run(&mut work, &mut simulators, &mut paused, asks, &mut each).await?;
+        match ended {
+            Ended::Done => {}
+            Ended::Stopped => return Ok(run.summary(&setup, &work, End::Stopped)),
+            Ended::Interrupted(tags) => {
+                tracing::info!(newest = tags.newest, "the round waits: something was tagged");
+                work.interrupt(tags)?;
+            }
         }
+    }
+}
+
+/// Looks for tags of this garment in the store, every so often.
+fn looks(
+    publisher: &impl Publish,
+    mut known: u64,
+    every: Duration,
+) -> impl AsyncFnMut() -> Option<TagRecord> {
+    let mut looked = Instant::now();
+    async move || {
+        if looked.elapsed() < every {
+            return None;
+        }
+        looked = Instant::now();
+        // A store that cannot be read is spoken of between rounds.
+        let Tagged { newest, states } = publisher.tagged(known).await.ok()?;
+        known = newest;
+        (!states.is_empty()).then_some(TagRecord { newest, states })
     }
 }
 
@@ -359,13 +403,15 @@ async fn between_rounds(
     if work.ledger().phase() == Phase::Merge {
         work.merge_initial()?;
     }
-    if work.ledger().phase() != Phase::Expansion {
+    // Whoever tagged waits for the next round, and for the version that follows on it.
+    if work.ledger().phase() != Phase::Expansion || work.ledger().tags_wait() {
         return Ok(None);
     }
     let every = setup.scene.exploration.publish_every_frames.max(1);
     if *behind || due(work, every) {
         let newest = work.graph().commit();
-        publish(work, publisher, newest).await?;
+        let soon = work.ledger().is_round_of_tags();
+        publish(work, publisher, (newest, soon)).await?;
         *behind = false;
         progress(&run.progress(setup, work, None));
     }
@@ -445,9 +491,10 @@ fn reached(graph: &Graph, options: &ExploreOptions) -> Option<End> {
 async fn publish(
     work: &mut Work,
     publisher: &mut impl Publish,
-    shown: u64,
+    (shown, soon): (u64, bool),
 ) -> Result<(), ExploreError> {
-    let number = publisher.publish(&work.view(shown)).await?;
+    tracing::info!(soon, states = work.graph().next_id().0, "publishing");
+    let number = publisher.publish(&work.view(shown), soon).await?;
     let commit = work.graph().commit();
     Ok(work.published(PublishRecord { number, commit, shown })?)
 }
@@ -465,7 +512,7 @@ async fn finish(
     let shown = best.unwrap_or(newest);
     let shows = work.ledger().published().map(|last| last.shown);
     if shows != Some(shown) || publisher.lacks_upsampler() {
-        publish(&mut work, publisher, shown).await?;
+        publish(&mut work, publisher, (shown, false)).await?;
     }
     Ok(run.summary(setup, &work, end))
 }

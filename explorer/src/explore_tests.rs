@@ -38,7 +38,11 @@ impl Publish for Memory {
         ((number > 0).then_some(VersionNumber(number)), states as u64)
     }
 
-    async fn publish(&mut self, view: &dyn GraphView) -> Result<VersionNumber, PublishError> {
+    async fn publish(
+        &mut self,
+        view: &dyn GraphView,
+        _soon: bool,
+    ) -> Result<VersionNumber, PublishError> {
         let links = view.links();
         let mut positions = vec![0.0; 3 * view.vertex_count()];
         let mut first_coordinates = Vec::new();
@@ -474,6 +478,8 @@ fn what_people_point_at_is_simulated_next_and_shown_at_once() {
 
 #[path = "explore_scale_tests.rs"]
 mod scale;
+#[path = "explore_tags_tests.rs"]
+mod tags;
 
 #[test]
 fn nothing_merges_into_a_flagged_state_where_its_pose_has_another() {

@@ -113,6 +113,18 @@ impl Actor {
         let start = Instant::now();
         self.decode()?;
         decode_us.record(start.elapsed().as_secs_f64() * 1e6);
+        self.put(writer);
+        Ok(())
+    }
+
+    /// Writes cloth that was decoded together with others'.
+    pub fn write_decoded(&mut self, positions: &[f32], writer: &mut FrameWriter) {
+        self.positions.clear();
+        self.positions.extend_from_slice(positions);
+        self.put(writer);
+    }
+
+    fn put(&mut self, writer: &mut FrameWriter) {
         let character = &self.character;
         let scene = character.version().scene();
         scene.skeleton().world(&character.world_pose(), &mut self.joints);
@@ -139,7 +151,6 @@ impl Actor {
             joints,
             distances: &distances,
         });
-        Ok(())
     }
 
     fn decode(&mut self) -> Result<()> {

@@ -7,6 +7,7 @@ mod actor;
 mod air;
 pub mod answers;
 mod app;
+mod crowd;
 mod dial;
 mod http;
 mod session;

@@ -13,6 +13,7 @@ use super::actor::{Actor, Blending, Still};
 use super::air::{self, Air};
 use super::answers;
 use super::app::App;
+use super::crowd::Crowd;
 use super::dial;
 use super::stand_in::StandIn;
 use super::steering::Steering;
@@ -126,6 +127,7 @@ pub struct Show {
     air: Air,
     clock: Clock,
     writer: FrameWriter,
+    crowd: Crowd,
     figures: Figures,
     meshes_of: Option<u64>,
 }
@@ -188,6 +190,7 @@ impl Show {
             air: Air::default(),
             clock,
             writer: FrameWriter::default(),
+            crowd: Crowd::default(),
             figures: Figures { seed, ..Figures::default() },
             meshes_of: None,
         }
@@ -207,10 +210,15 @@ impl Show {
         self.take_version(&mut said)?;
         let phase = self.clock.phase();
         self.writer.begin();
-        for actor in &mut self.actors {
-            let start = Instant::now();
-            actor.write(phase, &mut self.figures.decode_us, &mut self.writer)?;
-            self.figures.write_us.record(start.elapsed().as_secs_f64() * 1e6);
+        if let Mode::Crowd(_) = self.mode {
+            let figures = (&mut self.figures.decode_us, &mut self.figures.write_us);
+            self.crowd.write(&mut self.actors, phase, figures, &mut self.writer)?;
+        } else {
+            for actor in &mut self.actors {
+                let start = Instant::now();
+                actor.write(phase, &mut self.figures.decode_us, &mut self.writer)?;
+                self.figures.write_us.record(start.elapsed().as_secs_f64() * 1e6);
+            }
         }
         said.push(Said::Bytes(self.writer.end()));
         if self.figures.reported.is_none_or(|at| at.elapsed() >= REPORT) {

@@ -293,3 +293,36 @@ fn without_a_blend_the_jump_is_seen_and_without_counting_nothing_is_reported() {
     drop(character);
     assert!(stage.mailbox().drain().is_empty());
 }
+
+/// Characters at different places of the graph, decoded together, with and without a tier: every bit as
+/// if each were decoded alone.
+#[test]
+fn a_group_gets_what_each_would_get_alone() {
+    let version = tiny::version(1, tiny::initial_links());
+    let fixes = [VertexFix { state: 1, vertex: 0, offset_m: [0.0, 0.0, 0.25] }];
+    let view = tiny::view_with(&version, &[0], &fixes);
+    let stage = Arc::new(Stage::default());
+    stage.show(view);
+    let mut crowd: Vec<Character> = (0..37).map(|_| Character::enter(&stage).unwrap()).collect();
+    for (index, character) in crowd.iter_mut().enumerate() {
+        if index % 5 == 3 {
+            character.set_tier(16);
+        }
+        for step in 0..index {
+            character.step(at(1 - (step % 2) as u32));
+        }
+        character.sample(index as f32 / 37.0);
+    }
+    let all: Vec<&Character> = crowd.iter().collect();
+    let mut group = Group::default();
+    for columns in [usize::MAX, 1] {
+        let mut together = vec![9.0; 3 * all.len()];
+        group.decode(&all, 0..3, columns, &mut together).unwrap();
+        for (character, together) in all.iter().zip(together.chunks(3)) {
+            let mut alone = [7.0; 3];
+            decode(&[character], 0..3, columns, &mut alone).unwrap();
+            assert_eq!(together, alone);
+        }
+    }
+    assert!(group.decode(&all, 0..3, 1, &mut [0.0; 3]).is_err());
+}

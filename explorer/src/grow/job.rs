@@ -19,6 +19,8 @@ use crate::simulator::{FrameQuality, SimulateError, Simulator};
 
 /// Most states of one job. Only a dense primary graph gets there: beyond it the tree stops.
 pub const JOB_STATES_MAX: usize = 512;
+/// Most states of a job that somebody waits for: two seconds of cloth.
+pub const TAGGED_STATES_MAX: usize = 64;
 
 /// What jobs are judged by.
 #[derive(Debug, Clone, Copy)]
@@ -48,8 +50,8 @@ pub struct Context<'a> {
     pub known: &'a [Vec<StateId>],
     /// How to judge.
     pub rules: &'a Rules,
-    /// Whether a job that failed is run once more: the simulator may recover.
-    pub retries: bool,
+    /// Most states of a job.
+    pub states_max: usize,
     /// Set when jobs are to be dropped.
     pub abandon: &'a AtomicBool,
 }
@@ -141,46 +143,67 @@ pub fn initial(
     Ok(outcome)
 }
 
-/// Undoes the merge of the dead end `start`: simulates on from it along every out-edge, breadth
-/// first, until near a known state or at full depth, then merges the new dead ends.
+/// Undoes the merge of a dead end: simulates on from it along every out-edge, breadth first, until
+/// near a known state or at full depth, then merges the new dead ends.
 ///
-/// # Errors
-/// A frame could not be simulated, a state not read, or the job was dropped.
-pub fn expand(
-    context: &Context<'_>,
-    simulator: &mut dyn Simulator,
-    start: StateId,
-    start_pose: PoseId,
-) -> Result<Outcome, JobError> {
-    let state = context.states.read(start)?;
-    let root = Node {
-        parent: None,
-        edge: EdgeId(0),
-        pose: start_pose,
-        depth: 0,
-        class: context.similar.class(start),
-        state,
-        interior: true,
-    };
-    let mut tree = Tree { start, nodes: vec![root], quality: FrameQuality::default() };
-    let mut queue = VecDeque::from([0]);
-    while let Some(parent) = queue.pop_front() {
-        let pose = tree.nodes[parent].pose;
-        // Whatever is queued is interior and must be expanded, so room is kept for it.
-        for edge in context.primary.out_edges(pose) {
-            let child = tree.step(context, simulator, (parent, edge))?;
-            let waiting: usize = queue.iter().map(|&n| tree.degree(context, n)).sum();
-            let rest = context.primary.out_degree(pose);
-            let room = tree.nodes.len() + waiting + rest + tree.degree(context, child);
-            let node = &tree.nodes[child];
-            let deep = node.depth >= context.rules.depth_frames || room > JOB_STATES_MAX;
-            if !deep && !tree.is_near_known(context, child)? {
-                tree.nodes[child].interior = true;
-                queue.push_back(child);
-            }
-        }
+/// It may be left between two frames and gone on with later, by any worker: what comes of it is the same.
+pub struct Expansion {
+    tree: Tree,
+    queue: VecDeque<usize>,
+    /// The node being expanded, and which of its out-edges comes next.
+    at: Option<(usize, usize)>,
+}
+
+impl Expansion {
+    /// Of the dead end `start`.
+    ///
+    /// # Errors
+    /// Its state could not be read.
+    pub fn new(context: &Context<'_>, start: StateId, pose: PoseId) -> io::Result<Self> {
+        let root = Node {
+            parent: None,
+            edge: EdgeId(0),
+            pose,
+            depth: 0,
+            class: context.similar.class(start),
+            state: context.states.read(start)?,
+            interior: true,
+        };
+        let tree = Tree { start, nodes: vec![root], quality: FrameQuality::default() };
+        Ok(Self { tree, queue: VecDeque::from([0]), at: None })
     }
-    tree.into_outcome(context)
+
+    /// Goes on to its end, once.
+    ///
+    /// # Errors
+    /// A frame could not be simulated, a state not read; or [`JobError::Abandoned`]: it stands where it
+    /// was left, and may be run again.
+    pub fn run(
+        &mut self,
+        context: &Context<'_>,
+        simulator: &mut dyn Simulator,
+    ) -> Result<Outcome, JobError> {
+        let Self { tree, queue, at } = self;
+        while let Some((parent, first)) = at.or_else(|| queue.pop_front().map(|node| (node, 0))) {
+            let pose = tree.nodes[parent].pose;
+            // Whatever is queued is interior and must be expanded, so room is kept for it.
+            for (place, edge) in context.primary.out_edges(pose).enumerate().skip(first) {
+                *at = Some((parent, place));
+                let child = tree.step(context, simulator, (parent, edge))?;
+                let waiting: usize = queue.iter().map(|&n| tree.degree(context, n)).sum();
+                let rest = context.primary.out_degree(pose);
+                let room = tree.nodes.len() + waiting + rest + tree.degree(context, child);
+                let node = &tree.nodes[child];
+                let deep = node.depth >= context.rules.depth_frames || room > context.states_max;
+                if !deep && !tree.is_near_known(context, child)? {
+                    tree.nodes[child].interior = true;
+                    queue.push_back(child);
+                }
+            }
+            *at = None;
+        }
+        tree.outcome(context)
+    }
 }
 
 /// A state of an expansion; node 0 is the start.
@@ -285,7 +308,8 @@ impl Tree {
         order
     }
 
-    fn into_outcome(mut self, context: &Context<'_>) -> Result<Outcome, JobError> {
+    /// Its states move out of it.
+    fn outcome(&mut self, context: &Context<'_>) -> Result<Outcome, JobError> {
         let order = self.chains();
         let mut place = vec![Local::Known(self.start); self.nodes.len()];
         for (index, &node) in order.iter().enumerate() {

@@ -13,7 +13,7 @@ use super::class::Penalties;
 use super::graph::{Graph, GraphError, Kind};
 use super::plan::Plan;
 use super::policy::Steering;
-use super::record::{FailedRecord, JobRecord, MergeRecord, PublishRecord, Record};
+use super::record::{FailedRecord, JobRecord, MergeRecord, PublishRecord, Record, TagRecord};
 use super::view::KindAt;
 use crate::primary::PrimaryGraph;
 use crate::scene::Scene;
@@ -83,7 +83,11 @@ pub struct Ledger {
     /// The state of each pose that the initial pass keeps interior.
     placed: Vec<Option<StateId>>,
     planned_done: Vec<bool>,
+    /// Rounds that were opened.
+    rounds: u64,
     round: Round,
+    /// A round that tags interrupted; what is left of it comes after theirs.
+    parked: Option<Round>,
     set_aside: BTreeSet<StateId>,
     quality: FrameQuality,
     published: Option<PublishRecord>,
@@ -100,6 +104,13 @@ struct Tags {
     waiting: Vec<StateId>,
     /// Whether the open round, or the last that was, is theirs.
     have_round: bool,
+}
+
+impl Tags {
+    fn add(&mut self, tagged: &TagRecord) {
+        self.newest = tagged.newest;
+        self.waiting.extend(&tagged.states);
+    }
 }
 
 impl Ledger {
@@ -120,7 +131,9 @@ impl Ledger {
             round_jobs: scene.exploration.round_jobs.max(1) as usize,
             draped: false,
             placed,
+            rounds: 0,
             round: Round { number: 0, snapshot: 0, jobs: Vec::new(), done: 0 },
+            parked: None,
             set_aside: BTreeSet::new(),
             quality: FrameQuality::default(),
             published: None,
@@ -170,6 +183,11 @@ impl Ledger {
         self.tags.have_round
     }
 
+    /// Whether there are tags whose turn has not come yet.
+    pub fn tags_wait(&self) -> bool {
+        !self.tags.waiting.is_empty()
+    }
+
     /// The last version known to be in the store.
     pub fn published(&self) -> Option<PublishRecord> {
         self.published
@@ -209,15 +227,47 @@ impl Ledger {
         assert!(self.round.is_done(), "the round before is not done");
         let jobs = match self.phase() {
             Phase::Initial => self.ready(),
-            Phase::Expansion => self.expansions(),
+            Phase::Expansion => {
+                let tagged = self.tagged();
+                if tagged.is_empty() && self.unpark() {
+                    return true;
+                }
+                if tagged.is_empty() { self.expansions() } else { tagged }
+            }
             Phase::Drape | Phase::Merge => Vec::new(),
         };
         if jobs.is_empty() {
             return false;
         }
-        let number = if self.round.jobs.is_empty() { 0 } else { self.round.number + 1 };
+        let number = self.rounds;
+        self.rounds += 1;
         self.round = Round { number, snapshot: self.graph.commit(), jobs, done: 0 };
         true
+    }
+
+    /// Takes up what is left of a round that tags interrupted; false where nothing is.
+    fn unpark(&mut self) -> bool {
+        let Some(mut round) = self.parked.take() else { return false };
+        let mut left = round.jobs.split_off(round.done);
+        left.retain(|job| match job {
+            Job::Initial(_) => true,
+            Job::Expand(state) => {
+                is_dead_end(&self.graph, *state) && !self.set_aside.contains(state)
+            }
+        });
+        round.jobs.append(&mut left);
+        let goes_on = !round.is_done();
+        if goes_on {
+            self.round = round;
+        }
+        goes_on
+    }
+
+    /// The open round waits, and none is open.
+    fn park(&mut self) {
+        let Round { number, snapshot, .. } = self.round;
+        let none = Round { number, snapshot, jobs: Vec::new(), done: 0 };
+        self.parked = Some(std::mem::replace(&mut self.round, none));
     }
 
     /// Applies one record.
@@ -248,10 +298,10 @@ impl Ledger {
             }
             Record::Tagged(_) if !self.round.is_done() => Err(LedgerError::OutOfTurn("a tag")),
             Record::Tagged(tagged) => {
-                self.tags.newest = tagged.newest;
-                self.tags.waiting.extend(&tagged.states);
+                self.tags.add(tagged);
                 Ok(())
             }
+            Record::Interrupted(tagged) => self.apply_interruption(tagged),
         }
     }
 
@@ -266,17 +316,35 @@ impl Ledger {
         ready.into_iter().take(self.round_jobs).map(Job::Initial).collect()
     }
 
-    /// Dead ends to be expanded, by the policy.
-    fn expansions(&mut self) -> Vec<Job> {
+    /// Dead ends to be expanded because people pointed at them.
+    fn tagged(&mut self) -> Vec<Job> {
         let set_aside = &self.set_aside;
         let free = |state: StateId| !set_aside.contains(&state);
         let tagged = tagged(&self.graph, &mut self.tags.waiting, self.round_jobs, &free);
         self.tags.have_round = !tagged.is_empty();
-        if self.tags.have_round {
-            return tagged.into_iter().map(Job::Expand).collect();
-        }
+        tagged.into_iter().map(Job::Expand).collect()
+    }
+
+    /// Dead ends to be expanded, by the policy.
+    fn expansions(&mut self) -> Vec<Job> {
+        let set_aside = &self.set_aside;
+        let free = |state: StateId| !set_aside.contains(&state);
         let chosen = self.steering.choose(&self.graph, self.round_jobs, &free);
         chosen.into_iter().map(Job::Expand).collect()
+    }
+
+    fn apply_interruption(&mut self, tagged: &TagRecord) -> Result<(), LedgerError> {
+        // The round may have been interrupted before the first record of it.
+        if self.round.is_done() {
+            self.open_round();
+        }
+        let expands = self.phase() == Phase::Expansion && !self.tags.have_round;
+        if !expands || self.round.is_done() {
+            return Err(LedgerError::OutOfTurn("an interruption"));
+        }
+        self.park();
+        self.tags.add(tagged);
+        Ok(())
     }
 
     /// The job whose turn it is, if it is the one that was recorded.
@@ -394,11 +462,14 @@ fn tagged(
     let mut chosen = Vec::new();
     while let Some(state) = waiting.first().copied().filter(|_| chosen.len() < most) {
         waiting.remove(0);
-        let is_dead_end = state.0 < graph.next_id().0
-            && matches!(graph.kind_at(state, graph.commit()), KindAt::DeadEnd(..));
-        if is_dead_end && free(state) && !chosen.contains(&state) {
+        if is_dead_end(graph, state) && free(state) && !chosen.contains(&state) {
             chosen.push(state);
         }
     }
     chosen
+}
+
+fn is_dead_end(graph: &Graph, state: StateId) -> bool {
+    state.0 < graph.next_id().0
+        && matches!(graph.kind_at(state, graph.commit()), KindAt::DeadEnd(..))
 }

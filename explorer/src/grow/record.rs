@@ -31,6 +31,8 @@ pub enum Record {
     Steer(SteerRecord),
     /// People pointed at these dead ends: they come before all others, a round of their own.
     Tagged(TagRecord),
+    /// The same while a round was under way: what is left of it waits until theirs is done.
+    Interrupted(TagRecord),
 }
 
 /// Tags that were read.

@@ -1,27 +1,40 @@
 //! One round of jobs on any number of workers, committed in the order in which it was chosen.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
-use super::job::{self, Context, JobError, Outcome};
+use protocol::{PoseId, StateId};
+
+use super::class::Classifier;
+use super::job::{
+    self, Context, Expansion, JOB_STATES_MAX, JobError, Outcome, Rules, TAGGED_STATES_MAX,
+};
 use super::ledger::{Job, Phase};
+use super::plan::Plan;
+use super::record::TagRecord;
+use super::similar::Similar;
+use super::states::StateFile;
 use super::work::{Work, WorkError};
 use crate::cpu::CpuClock;
+use crate::primary::PrimaryGraph;
 use crate::simulator::Simulator;
 
 /// How often a running round looks whether it is to stop.
 const POLL: Duration = Duration::from_millis(50);
 
 /// How a round ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Ended {
     /// All its jobs are done.
     Done,
     /// It was asked to stop: jobs in flight were dropped, the others are done.
     Stopped,
+    /// People pointed at something: what is not committed waits in [`Paused`].
+    Interrupted(TagRecord),
 }
 
 /// Why a round could not go on.
@@ -39,57 +52,190 @@ pub enum RoundError {
     Read(std::io::Error),
 }
 
-/// Runs what is left of the open round. `each` is called after every job that was committed, or
-/// given up (with the reason).
+/// What was simulated of a round that was interrupted. It lives in memory alone: where it is lost, the
+/// same is simulated once more.
+#[derive(Default)]
+pub struct Paused {
+    round: u64,
+    ended: BTreeMap<StateId, Result<Outcome, JobError>>,
+    under_way: BTreeMap<StateId, Expansion>,
+}
+
+/// Runs what is left of the open round. `tags` is asked again and again once the initial pass is over,
+/// unless the round is one of tags itself: what people pointed at interrupts it between two frames of its
+/// jobs. `each` is called after every job that was committed, or given up (with the reason).
 ///
 /// # Errors
 /// The work folder cannot be read or written, or a frame of the initial pass cannot be simulated.
-pub fn run(
+pub async fn run(
     work: &mut Work,
-    simulators: &mut [Box<dyn Simulator>],
-    should_stop: &dyn Fn() -> bool,
+    simulators: &mut Vec<Box<dyn Simulator>>,
+    paused: &mut Paused,
+    (should_stop, tags): (&dyn Fn() -> bool, impl AsyncFnMut() -> Option<TagRecord>),
     each: &mut dyn FnMut(&Work, Option<&JobError>),
 ) -> Result<Ended, RoundError> {
-    let round = work.ledger().round().clone();
-    let states = Arc::clone(work.states());
-    let rules = *work.rules();
-    let (similar, classifier) = (Arc::clone(work.similar()), Arc::clone(work.classifier()));
-    let plan = Arc::clone(work.ledger().plan());
-    let primary = Arc::clone(work.graph().primary());
-    let known = work.ledger().interior_at(round.snapshot);
-    let abandon = AtomicBool::new(false);
-    let context = Context {
-        primary: &primary,
-        plan: &plan,
-        states: &states,
-        similar: &similar,
-        classifier: &classifier,
-        known: &known,
-        rules: &rules,
-        abandon: &abandon,
-        retries: simulators.iter().any(|simulator| simulator.may_recover()),
-    };
+    let round = work.ledger().round().number;
+    let Paused { mut ended, under_way, .. } =
+        if paused.round == round { std::mem::take(paused) } else { Paused::default() };
     let starts = starts(work);
-    let next = AtomicUsize::new(round.done);
-    std::thread::scope(|scope| {
-        let (sender, receiver) = mpsc::channel();
-        for simulator in simulators.iter_mut() {
-            let sender = sender.clone();
-            let (next, starts) = (&next, &starts);
-            scope.spawn(move || worker(&context, simulator.as_mut(), (next, starts), &sender));
+    let mut early = Early::new();
+    let mut left = vec![None; starts.len()];
+    for (place, (start, left)) in starts.iter().zip(&mut left).enumerate() {
+        match start.and_then(|(_, state, _)| ended.remove(&state)) {
+            Some(outcome) => _ = early.insert(place, outcome),
+            None => *left = *start,
         }
-        drop(sender);
-        let ended = collect(work, &receiver, (&abandon, should_stop), each);
-        // Also on an error: workers still running are not waited for longer than a frame.
-        abandon.store(true, Ordering::Relaxed);
-        ended
-    })
+    }
+    let shared = Arc::new(Shared::new(work, simulators, left, under_way));
+    let workers = Workers::start(&shared, simulators);
+    let ended = collect(work, &workers, &mut early, (should_stop, tags), each).await;
+    // Also on an error: workers still running are not waited for longer than a frame.
+    let rest = workers.join(simulators);
+    if matches!(ended, Ok(Ended::Interrupted(_))) {
+        for done in &rest {
+            work.add_cpu_s(done.cpu_s)?;
+        }
+        // What no worker had taken up again, and what they leave now.
+        *paused = Paused { round, under_way: shared.under_way(), ..Paused::default() };
+        paused.keep(&starts, early, rest);
+    }
+    ended
+}
+
+impl Paused {
+    fn keep(&mut self, starts: &[Option<Start>], mut early: Early, rest: Vec<Done>) {
+        let state = |place: usize| starts[place].map(|(_, state, _)| state);
+        for Done { place, outcome, expansion, .. } in rest {
+            match expansion {
+                Some(expansion) => self.under_way.extend(state(place).zip(Some(expansion))),
+                None => _ = early.insert(place, outcome),
+            }
+        }
+        early.retain(|_, outcome| !matches!(outcome, Err(JobError::Abandoned)));
+        self.ended.extend(early.into_iter().filter_map(|(place, o)| state(place).zip(Some(o))));
+    }
 }
 
 /// A job with the state and pose it starts from.
-type Start = (Job, protocol::StateId, protocol::PoseId);
-/// A job's place in the round, what came of it, and its CPU seconds.
-type Done = (usize, Result<Outcome, JobError>, f64);
+type Start = (Job, StateId, PoseId);
+/// Outcomes whose turn has not come, by their place in the round.
+type Early = BTreeMap<usize, Result<Outcome, JobError>>;
+
+/// What a worker says of a job.
+struct Done {
+    /// Its place in the round.
+    place: usize,
+    outcome: Result<Outcome, JobError>,
+    /// An expansion that was left between two frames.
+    expansion: Option<Expansion>,
+    cpu_s: f64,
+}
+
+/// What the workers of a round share.
+struct Shared {
+    primary: Arc<PrimaryGraph>,
+    plan: Arc<Plan>,
+    states: Arc<StateFile>,
+    similar: Arc<Similar>,
+    classifier: Arc<Classifier>,
+    known: Vec<Vec<StateId>>,
+    rules: Rules,
+    states_max: usize,
+    retries: bool,
+    starts: Vec<Option<Start>>,
+    next: AtomicUsize,
+    abandon: AtomicBool,
+    under_way: Mutex<BTreeMap<StateId, Expansion>>,
+}
+
+impl Shared {
+    fn new(
+        work: &Work,
+        simulators: &[Box<dyn Simulator>],
+        starts: Vec<Option<Start>>,
+        under_way: BTreeMap<StateId, Expansion>,
+    ) -> Self {
+        let ledger = work.ledger();
+        let tagged = ledger.is_round_of_tags();
+        Self {
+            primary: Arc::clone(work.graph().primary()),
+            plan: Arc::clone(ledger.plan()),
+            states: Arc::clone(work.states()),
+            similar: Arc::clone(work.similar()),
+            classifier: Arc::clone(work.classifier()),
+            known: ledger.interior_at(ledger.round().snapshot),
+            rules: *work.rules(),
+            states_max: if tagged { TAGGED_STATES_MAX } else { JOB_STATES_MAX },
+            retries: simulators.iter().any(|simulator| simulator.may_recover()),
+            starts,
+            next: AtomicUsize::new(ledger.round().done),
+            abandon: AtomicBool::new(false),
+            under_way: Mutex::new(under_way),
+        }
+    }
+
+    fn context(&self) -> Context<'_> {
+        Context {
+            primary: &self.primary,
+            plan: &self.plan,
+            states: &self.states,
+            similar: &self.similar,
+            classifier: &self.classifier,
+            known: &self.known,
+            rules: &self.rules,
+            states_max: self.states_max,
+            abandon: &self.abandon,
+        }
+    }
+
+    /// Takes the expansions that wait to be gone on with.
+    fn under_way(&self) -> BTreeMap<StateId, Expansion> {
+        std::mem::take(&mut *self.under_way.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// One job, from where it stands to its end or until it is to be left.
+    fn job(&self, simulator: &mut dyn Simulator, place: usize, start: Start) -> Done {
+        let clock = CpuClock::start();
+        let context = self.context();
+        let (outcome, expansion) = match start {
+            (Job::Initial(planned), state, _) => {
+                let planned = &self.plan.jobs()[planned];
+                let run = || job::initial(&context, simulator, planned, state);
+                (twice(self.retries, run), None)
+            }
+            (Job::Expand(_), state, pose) => self.expand(&context, simulator, (state, pose)),
+        };
+        Done { place, outcome, expansion, cpu_s: clock.elapsed_s() }
+    }
+
+    fn expand(
+        &self,
+        context: &Context<'_>,
+        simulator: &mut dyn Simulator,
+        (state, pose): (StateId, PoseId),
+    ) -> (Result<Outcome, JobError>, Option<Expansion>) {
+        let held = self.under_way.lock().unwrap_or_else(PoisonError::into_inner).remove(&state);
+        let expansion = held.map_or_else(|| Expansion::new(context, state, pose), Ok);
+        let mut expansion = match expansion {
+            Ok(expansion) => expansion,
+            Err(error) => return (Err(error.into()), None),
+        };
+        let outcome = twice(self.retries, || expansion.run(context, simulator));
+        let left = matches!(outcome, Err(JobError::Abandoned));
+        (outcome, left.then_some(expansion))
+    }
+}
+
+/// Once more where the simulator may have recovered.
+fn twice(
+    retries: bool,
+    mut run: impl FnMut() -> Result<Outcome, JobError>,
+) -> Result<Outcome, JobError> {
+    match run() {
+        Err(JobError::Simulate { .. }) if retries => run(),
+        outcome => outcome,
+    }
+}
 
 /// The jobs of the round that are not done, by their place (`None`: done before).
 fn starts(work: &Work) -> Vec<Option<Start>> {
@@ -107,49 +253,68 @@ fn starts(work: &Work) -> Vec<Option<Start>> {
     round.jobs.iter().enumerate().map(start).collect()
 }
 
-fn worker(
-    context: &Context<'_>,
-    simulator: &mut dyn Simulator,
-    (next, starts): (&AtomicUsize, &[Option<Start>]),
-    sender: &mpsc::Sender<Done>,
-) {
-    while !context.abandon.load(Ordering::Relaxed) {
-        let place = next.fetch_add(1, Ordering::Relaxed);
-        let Some(Some((job, state, pose))) = starts.get(place) else { return };
-        let clock = CpuClock::start();
-        let mut run = || match job {
-            Job::Initial(planned) => {
-                job::initial(context, simulator, &context.plan.jobs()[*planned], *state)
-            }
-            Job::Expand(_) => job::expand(context, simulator, *state, *pose),
+/// The threads of a round. Dropped, they end within a frame.
+struct Workers {
+    shared: Arc<Shared>,
+    receiver: mpsc::Receiver<Done>,
+    threads: Vec<JoinHandle<Box<dyn Simulator>>>,
+}
+
+impl Workers {
+    fn start(shared: &Arc<Shared>, simulators: &mut Vec<Box<dyn Simulator>>) -> Self {
+        let (sender, receiver) = mpsc::channel();
+        let thread = |mut simulator: Box<dyn Simulator>| {
+            let (shared, sender) = (Arc::clone(shared), sender.clone());
+            std::thread::spawn(move || {
+                worker(&shared, simulator.as_mut(), &sender);
+                simulator
+            })
         };
-        let mut outcome = run();
-        if matches!(outcome, Err(JobError::Simulate { .. })) && context.retries {
-            outcome = run();
+        let threads = simulators.drain(..).map(thread).collect();
+        Self { shared: Arc::clone(shared), receiver, threads }
+    }
+
+    /// Has jobs in flight left, and says what the workers had not told yet.
+    fn join(mut self, simulators: &mut Vec<Box<dyn Simulator>>) -> Vec<Done> {
+        self.shared.abandon.store(true, Ordering::Relaxed);
+        for thread in self.threads.drain(..) {
+            match thread.join() {
+                Ok(simulator) => simulators.push(simulator),
+                Err(panic) => std::panic::resume_unwind(panic),
+            }
         }
-        if sender.send((place, outcome, clock.elapsed_s())).is_err() {
+        self.receiver.try_iter().collect()
+    }
+}
+
+impl Drop for Workers {
+    fn drop(&mut self) {
+        self.shared.abandon.store(true, Ordering::Relaxed);
+    }
+}
+
+fn worker(shared: &Shared, simulator: &mut dyn Simulator, sender: &mpsc::Sender<Done>) {
+    while !shared.abandon.load(Ordering::Relaxed) {
+        let place = shared.next.fetch_add(1, Ordering::Relaxed);
+        let Some(start) = shared.starts.get(place) else { return };
+        let Some(start) = *start else { continue };
+        if sender.send(shared.job(simulator, place, start)).is_err() {
             return;
         }
     }
 }
 
 /// Commits outcomes in order as they come.
-fn collect(
+async fn collect(
     work: &mut Work,
-    receiver: &mpsc::Receiver<Done>,
-    (abandon, should_stop): (&AtomicBool, &dyn Fn() -> bool),
+    workers: &Workers,
+    early: &mut Early,
+    (should_stop, mut tags): (&dyn Fn() -> bool, impl AsyncFnMut() -> Option<TagRecord>),
     each: &mut dyn FnMut(&Work, Option<&JobError>),
 ) -> Result<Ended, RoundError> {
-    let mut early = BTreeMap::new();
-    while !work.ledger().round().is_done() {
-        match receiver.recv_timeout(POLL) {
-            Ok((place, outcome, cpu_s)) => {
-                early.insert(place, outcome);
-                work.add_cpu_s(cpu_s)?;
-            }
-            Err(RecvTimeoutError::Timeout) => {}
-            Err(RecvTimeoutError::Disconnected) => return Ok(Ended::Stopped),
-        }
+    let ledger = work.ledger();
+    let may_wait = ledger.phase() == Phase::Expansion && !ledger.is_round_of_tags();
+    loop {
         while let Some(outcome) = early.remove(&work.ledger().round().done) {
             match outcome {
                 Ok(outcome) => {
@@ -162,11 +327,24 @@ fn collect(
                 },
             }
         }
+        if work.ledger().round().is_done() {
+            return Ok(Ended::Done);
+        }
+        if may_wait && let Some(tags) = tags().await {
+            return Ok(Ended::Interrupted(tags));
+        }
+        match workers.receiver.recv_timeout(POLL) {
+            Ok(Done { place, outcome, cpu_s, .. }) => {
+                early.insert(place, outcome);
+                work.add_cpu_s(cpu_s)?;
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => return Ok(Ended::Stopped),
+        }
         if should_stop() {
-            abandon.store(true, Ordering::Relaxed);
+            workers.shared.abandon.store(true, Ordering::Relaxed);
         }
     }
-    Ok(Ended::Done)
 }
 
 /// Records a job that failed; `None` where it was only dropped.

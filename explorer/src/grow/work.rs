@@ -231,6 +231,14 @@ impl Work {
         self.record(&Record::Tagged(tagged))
     }
 
+    /// The same while a round is open: it waits until theirs is done.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub fn interrupt(&mut self, tagged: TagRecord) -> Result<(), WorkError> {
+        self.record(&Record::Interrupted(tagged))
+    }
+
     /// Commits the outcome of the round's next job.
     ///
     /// # Errors

@@ -204,12 +204,25 @@ impl Publisher {
         self.commit(prepared).await
     }
 
+    /// The same on the basis that the head has, also where a new one would pay: somebody waits.
+    ///
+    /// # Errors
+    /// Nothing was published; the head is as it was.
+    pub async fn publish_soon(&mut self, view: &dyn GraphView) -> Result<Published, PublishError> {
+        let prepared = self.prepare_on(view, false)?;
+        self.commit(prepared).await
+    }
+
     /// Checks totality and encodes what is new. Touches no store and changes nothing; takes CPU
     /// time (of the order of a millisecond a new state, more for the first version).
     ///
     /// # Errors
     /// The view is not total, not of this scene, or cannot be encoded.
     pub fn prepare(&self, view: &dyn GraphView) -> Result<Prepared, PublishError> {
+        self.prepare_on(view, true)
+    }
+
+    fn prepare_on(&self, view: &dyn GraphView, may_rebase: bool) -> Result<Prepared, PublishError> {
         let (found, expected) = (view.vertex_count(), self.scene.vertex_count);
         if found != expected {
             return Err(PublishError::Vertices { view: found, garment: expected });
@@ -218,7 +231,7 @@ impl Publisher {
         let pages = self.total(&links)?;
         let before = self.garment();
         let states = links.len() as u64;
-        let rebased = self.pays_to_rebase(states);
+        let rebased = may_rebase && self.pays_to_rebase(states);
         let kept = before.filter(|_| !rebased);
         let cuts = regions::cut(view.runs(), kept.map_or(0, covered), states)?;
         let encoding = Encoding {
