@@ -41,8 +41,8 @@ fn print(r: &DecodeReport) {
     line("normals of all vertices", r.normals_us, None);
     line("faer, f32", r.faer_us, None);
     line("plain loop, f32", r.plain_us, None);
-    let operator = format!("operator {fine} x {coarse}, 16-bit weights");
+    let operator = format!("operator {fine} x {coarse}, 8-bit weights");
     line(&operator, r.operator_hot_us, Some(r.operator_cold_us));
     line("  f32 weights", r.operator_f32_hot_us, Some(r.operator_f32_cold_us));
-    println!("operator's 16-bit weights: within {:.2} mm of f64", r.operator_error_mm);
+    println!("operator's 8-bit weights: within {:.2} mm of f64", r.operator_error_mm);
 }

@@ -246,7 +246,12 @@ fn table(r: &Report) -> String {
         let _ = writeln!(out);
     }
     for b in &r.rounding {
-        let _ = writeln!(out, "{} bits: rms {:.4} mm, max {:.3}", b.bits, b.rms_mm, b.max_mm);
+        let how = if b.along { ", rounded along the training motion" } else { "" };
+        let _ = writeln!(
+            out,
+            "{} bits{how}: rms {:.4} mm, max {:.3}; other motions {:.4}",
+            b.bits, b.rms_mm, b.max_mm, b.others_rms_mm
+        );
     }
     for [hertz, share] in &r.modes {
         let _ = writeln!(out, "modes: {hertz:.2} Hz, {:.1} % of what was left", 100.0 * share);

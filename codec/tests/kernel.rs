@@ -123,9 +123,17 @@ proptest! {
     ) {
         let weights = noise(seed, fine * coarse);
         let points = noise(seed + 1, 3 * coarse);
+        // Bytes, and bytes of which most are zero: panels then lack pairs of columns.
+        let bytes: Vec<i16> = weights.iter().map(|w| (127.0 * w) as i16).collect();
+        let near = |i: usize| (i % coarse).abs_diff(i / coarse * coarse / fine) < 3;
+        let sparse: Vec<i16> =
+            (0..bytes.len()).map(|i| if near(i) { bytes[i] } else { 0 }).collect();
+        let ones = || vec![1.0; fine];
         for operator in [
             Operator::quantised(fine, coarse, &weights).unwrap(),
             Operator::float(fine, coarse, &weights).unwrap(),
+            Operator::from_steps(coarse, &bytes, ones(), ones()).unwrap(),
+            Operator::from_steps(coarse, &sparse, ones(), ones()).unwrap(),
         ] {
             let mut twin = vec![0.0; 3 * fine];
             operator.apply_with(Set::Scalar, &points, &mut twin).unwrap();
@@ -272,6 +280,31 @@ fn the_operator_is_close_to_f64_and_moves_with_the_cloth() {
             assert!((moved - 128.0 - out).abs() < most_far, "{i}: {moved} {out}");
         }
     }
+}
+
+#[test]
+fn bytes_and_absent_pairs_are_the_same_operator_in_less_memory() {
+    let (fine, coarse) = (500, 60);
+    let near = |i: usize| (i % coarse).abs_diff(i / coarse * coarse / fine) < 6;
+    let all = noise(51, fine * coarse);
+    let step = |i: usize| if near(i) { (127.0 * all[i]) as i16 } else { 0 };
+    let steps: Vec<i16> = (0..fine * coarse).map(step).collect();
+    let (units, sums) = (vec![0.01; fine], vec![1.0; fine]);
+    let narrow = Operator::from_steps(coarse, &steps, units.clone(), sums.clone()).unwrap();
+    // Ten times the steps at a tenth of the unit do not fit a byte.
+    let tenfold: Vec<i16> = steps.iter().map(|s| 10 * s).collect();
+    let wide = Operator::from_steps(coarse, &tenfold, vec![0.001; fine], sums.clone()).unwrap();
+    let dense: Vec<i16> = all.iter().map(|w| (127.0 * w) as i16).collect();
+    let dense = Operator::from_steps(coarse, &dense, units, sums).unwrap();
+    let [small, large, full] = [&narrow, &wide, &dense].map(Operator::resident_bytes);
+    assert!(2 * small < large + 4 * fine + 4096, "{small} {large}");
+    assert!(2 * small < full, "{small} {full}");
+    let points = noise(52, 3 * coarse);
+    let (mut a, mut b) = (vec![0.0; 3 * fine], vec![0.0; 3 * fine]);
+    narrow.apply(&points, &mut a).unwrap();
+    wide.apply(&points, &mut b).unwrap();
+    assert!(a.iter().zip(&b).all(|(a, b)| (a - b).abs() < 1e-4));
+    assert!(a.iter().any(|x| x.abs() > 0.1));
 }
 
 #[test]

@@ -1,12 +1,14 @@
 //! The upsampling operator: fine positions = U x coarse positions (Kavan et al. 2011, section 3).
 //!
-//! The same pair loops as for a basis: weights are 16-bit integers, each row with a unit of its own;
-//! coarse positions are rounded to 16 bits of their bounding box. Positions enter relative to the
+//! The same pair loops as for a basis: weights are 8- or 16-bit integers, each row with a unit of its
+//! own; pairs of columns that are zero in a whole panel are left out, so that compact support is worth
+//! its bytes; coarse positions are rounded to 16 bits of their bounding box. Positions enter relative to the
 //! middle of that box, and the middle times the row's true sum of weights is added back in f32, so
 //! that a cloth far from the origin loses nothing. The f32 form is the reference, at twice the bytes.
 
 use super::memory::{Huge, with_huge_pages};
-use super::pairs::{Chunk, Entry, Pair, Sums, packed};
+use super::pairs::{Chunk, Pair, Sums, packed};
+use super::panels::Narrowed;
 use super::{PANEL_ROWS, Set};
 use crate::ROWS_MAX;
 
@@ -14,6 +16,8 @@ use crate::ROWS_MAX;
 pub const COARSE_MAX: usize = 1024;
 /// Fine points of an operator, at most.
 pub const FINE_MAX: usize = ROWS_MAX / 3;
+/// Largest step that a byte holds, both ways.
+const NARROW_MAX: u16 = 127;
 /// Largest rounded position.
 const STEPS: f32 = 32_767.0;
 
@@ -22,17 +26,59 @@ const STEPS: f32 = 32_767.0;
 pub struct Operator {
     fine: usize,
     coarse: usize,
-    /// Of each row, the sum of its weights: 1 where they are a partition of unity.
+    /// Of each row, the sum of its weights; none where all are a partition of unity.
     row_sums: Vec<f32>,
     weights: Weights,
 }
 
 #[derive(Debug, Clone)]
 enum Weights {
-    /// Panel after panel pairs of columns; what a weight of 1 stands for, a row.
-    Whole { chunks: Huge<Chunk<i16>>, units: Vec<f32> },
+    /// 16-bit steps; what a step stands for, a row.
+    Wide(Steps<i16>, Vec<f32>),
+    /// 8-bit steps likewise.
+    Narrow(Steps<i8>, Vec<f32>),
     /// Panel after panel the columns.
     Float(Vec<Sums>),
+}
+
+/// Steps, panel after panel: of each panel the pairs of columns that are not all zero in it.
+#[derive(Debug, Clone)]
+struct Steps<T: Copy> {
+    chunks: Huge<Chunk<T>>,
+    /// Which pair of columns each chunk holds.
+    pairs: Vec<u16>,
+    /// One past each panel's last chunk.
+    ends: Vec<u32>,
+}
+
+impl<T: Narrowed> Steps<T> {
+    /// From steps row after row.
+    fn new(coarse: usize, steps: &[i16]) -> Self {
+        let (mut chunks, mut pairs, mut ends) = (Vec::new(), Vec::new(), Vec::new());
+        for rows in steps.chunks(PANEL_ROWS * coarse) {
+            for pair in 0..coarse.div_ceil(2) {
+                let mut chunk = Chunk([T::default(); 2 * PANEL_ROWS]);
+                let mut empty = true;
+                for (row, steps) in rows.chunks(coarse).enumerate() {
+                    for (side, step) in steps[2 * pair..].iter().take(2).enumerate() {
+                        chunk.0[2 * row + side] = T::narrowed(*step);
+                        empty &= *step == 0;
+                    }
+                }
+                if !empty {
+                    chunks.push(chunk);
+                    pairs.push(pair as u16);
+                }
+            }
+            ends.push(chunks.len() as u32);
+        }
+        let chunks = Huge::new(&chunks, Chunk([T::default(); 2 * PANEL_ROWS]));
+        Self { chunks, pairs, ends }
+    }
+
+    fn bytes(&self) -> usize {
+        size_of_val(&self.chunks[..]) + size_of_val(&self.pairs[..]) + size_of_val(&self.ends[..])
+    }
 }
 
 /// Why an operator could not be made or applied.
@@ -80,7 +126,7 @@ pub enum OperatorError {
 }
 
 /// Largest sum of absolute weights (steps) of a row.
-const ROW_STEPS_MAX: u64 = i32::MAX as u64 / 32_767;
+pub(crate) const ROW_STEPS_MAX: u64 = i32::MAX as u64 / 32_767;
 
 /// Rounds one row of weights to 16 bits and returns what a step stands for: the smallest unit at
 /// which each weight fits and the row's sums fit 32 bits. The error is at most half a unit a weight.
@@ -121,7 +167,7 @@ impl Operator {
     }
 
     /// From weights that were rounded before: row after row `coarse` steps; for each row what a
-    /// step stands for, and the true sum of its weights.
+    /// step stands for, and the true sum of its weights. Steps within -127..=127 take a byte each.
     ///
     /// # Errors
     /// As for [`Operator::quantised`], and a row whose sums could leave 32 bits.
@@ -143,22 +189,15 @@ impl Operator {
                 return Err(OperatorError::Headroom { row, sum, most: ROW_STEPS_MAX });
             }
         }
-        let panels = fine.div_ceil(PANEL_ROWS);
-        let mut chunks = Vec::with_capacity(panels * coarse.div_ceil(2));
-        for panel in 0..panels {
-            for pair in 0..coarse.div_ceil(2) {
-                let mut chunk = Chunk([0i16; 2 * PANEL_ROWS]);
-                for (i, entry) in chunk.0.iter_mut().enumerate() {
-                    let (row, column) = (panel * PANEL_ROWS + i / 2, 2 * pair + i % 2);
-                    if row < fine && column < coarse {
-                        *entry = steps[row * coarse + column];
-                    }
-                }
-                chunks.push(chunk);
-            }
-        }
-        let chunks = Huge::new(&chunks, Chunk([0i16; 2 * PANEL_ROWS]));
-        Ok(Self { fine, coarse, row_sums, weights: Weights::Whole { chunks, units } })
+        let partition = row_sums.iter().all(|sum| sum.to_bits() == 1.0f32.to_bits());
+        let row_sums = if partition { Vec::new() } else { row_sums };
+        let narrow = steps.iter().all(|step| step.unsigned_abs() <= NARROW_MAX);
+        let weights = if narrow {
+            Weights::Narrow(Steps::new(coarse, steps), units)
+        } else {
+            Weights::Wide(Steps::new(coarse, steps), units)
+        };
+        Ok(Self { fine, coarse, row_sums, weights })
     }
 
     /// With the f32 weights as they are.
@@ -194,7 +233,8 @@ impl Operator {
     /// Memory held by weights, units and sums (bytes).
     pub fn resident_bytes(&self) -> usize {
         let weights = match &self.weights {
-            Weights::Whole { chunks, units } => size_of_val(&chunks[..]) + size_of_val(&units[..]),
+            Weights::Wide(steps, units) => steps.bytes() + size_of_val(&units[..]),
+            Weights::Narrow(steps, units) => steps.bytes() + size_of_val(&units[..]),
             Weights::Float(columns) => size_of_val(&columns[..]),
         };
         weights + size_of_val(&self.row_sums[..])
@@ -225,52 +265,49 @@ impl Operator {
         finite("coarse positions", coarse_m)?;
         let set = set.checked();
         match &self.weights {
-            Weights::Whole { chunks, units } => self.whole(set, chunks, units, coarse_m, fine_m),
+            Weights::Wide(steps, units) => self.whole(set, steps, units, coarse_m, fine_m),
+            Weights::Narrow(steps, units) => self.whole(set, steps, units, coarse_m, fine_m),
             Weights::Float(columns) => self.floats(set, columns, coarse_m, fine_m),
         }
         Ok(())
     }
 
-    fn whole(
+    fn whole<T: Narrowed>(
         &self,
         set: Set,
-        chunks: &[Chunk<i16>],
+        steps: &Steps<T>,
         units: &[f32],
         coarse_m: &[f32],
         fine_m: &mut [f32],
     ) {
         let (middle, half) = box_of(coarse_m);
         let factors = half.map(|h| h / STEPS);
-        let gains = half.map(|h| STEPS / h);
         let mut pairs = [Pair::<3>::ZERO; COARSE_MAX / 2];
-        let count = self.coarse.div_ceil(2);
-        for (at, (pair, points)) in pairs.iter_mut().zip(coarse_m.chunks(6)).enumerate() {
-            pair.at = at as u32;
-            for (axis, both) in pair.coefficients.iter_mut().enumerate() {
-                let rounded = |i: usize| {
-                    let steps = points.get(i).map_or(0.0, |p| (p - middle[axis]) * gains[axis]);
-                    steps.round_ties_even().clamp(-STEPS, STEPS) as i16
-                };
-                *both = packed(rounded(axis), rounded(3 + axis));
-            }
-        }
-        let rows = units.chunks(PANEL_ROWS).zip(self.row_sums.chunks(PANEL_ROWS));
-        let panels = chunks.chunks(count).zip(fine_m.chunks_mut(3 * PANEL_ROWS));
-        for ((chunks, fine), (units, row_sums)) in panels.zip(rows) {
+        let pairs = &mut pairs[..self.coarse.div_ceil(2)];
+        round_positions(coarse_m, middle, half, pairs);
+        let mut own = [Pair::<3>::ZERO; COARSE_MAX / 2];
+        ask_for_pages(fine_m);
+        ask_for_pages(units);
+        ask_for_pages(&self.row_sums);
+        let panels = steps.ends.iter().zip(fine_m.chunks_mut(3 * PANEL_ROWS));
+        let mut first = 0;
+        for ((panel, (end, fine)), units) in (0..).zip(panels).zip(units.chunks(PANEL_ROWS)) {
+            let these = panel * PANEL_ROWS..panel * PANEL_ROWS + units.len();
+            let row_sums = self.row_sums.get(these).unwrap_or(&[1.0; PANEL_ROWS][..units.len()]);
+            let range = first..*end as usize;
+            first = range.end;
             let mut sums = [Sums([0.0; PANEL_ROWS]); 3];
-            i16::add(set, chunks, &pairs[..count], &factors, &mut sums);
-            for (sums, middle) in sums.iter_mut().zip(middle) {
-                let rows = units.iter().zip(row_sums);
-                for (sum, (unit, row_sum)) in sums.0.iter_mut().zip(rows) {
-                    *sum = *sum * unit + middle * row_sum;
+            let chunks = &steps.chunks[range.clone()];
+            if chunks.len() == pairs.len() {
+                T::add(set, chunks, pairs, &factors, &mut sums);
+            } else {
+                let own = &mut own[..chunks.len()];
+                for ((at, own), pair) in (0..).zip(own.iter_mut()).zip(&steps.pairs[range]) {
+                    *own = Pair { at, ..pairs[usize::from(*pair)] };
                 }
+                T::add(set, chunks, own, &factors, &mut sums);
             }
-            let [x, y, z] = &sums;
-            let (points, _) = fine.as_chunks_mut::<3>();
-            let axes = x.0.iter().zip(&y.0).zip(&z.0);
-            for (point, ((x, y), z)) in points.iter_mut().zip(axes) {
-                *point = [*x, *y, *z];
-            }
+            finish(set, &sums, middle, (units, row_sums), fine);
         }
     }
 
@@ -284,6 +321,68 @@ impl Operator {
                     *fine = sums.0[row];
                 }
             }
+        }
+    }
+}
+
+#[allow(unsafe_code)] // calls of functions compiled for a detected instruction set
+fn finish(
+    set: Set,
+    sums: &[Sums; 3],
+    middle: [f32; 3],
+    rows: (&[f32], &[f32]),
+    fine_m: &mut [f32],
+) {
+    match set {
+        // SAFETY: `Set::checked` gave these sets because this CPU has them; the body is safe code.
+        #[cfg(target_arch = "x86_64")]
+        Set::Avx512Vnni => unsafe { finished_avx512(sums, middle, rows, fine_m) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        Set::Avx2 => unsafe { finished_avx2(sums, middle, rows, fine_m) },
+        _ => finished(sums, middle, rows, fine_m),
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+fn finished_avx512(sums: &[Sums; 3], middle: [f32; 3], rows: (&[f32], &[f32]), fine_m: &mut [f32]) {
+    finished(sums, middle, rows, fine_m);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn finished_avx2(sums: &[Sums; 3], middle: [f32; 3], rows: (&[f32], &[f32]), fine_m: &mut [f32]) {
+    finished(sums, middle, rows, fine_m);
+}
+
+/// Units and middle of a panel's sums, and its points in their places.
+#[inline(always)]
+fn finished(
+    sums: &[Sums; 3],
+    middle: [f32; 3],
+    (units, row_sums): (&[f32], &[f32]),
+    fine_m: &mut [f32],
+) {
+    // Lengths known beforehand let the compiler write whole vectors.
+    let whole: (Result<&[f32; PANEL_ROWS], _>, Result<&[f32; PANEL_ROWS], _>) =
+        (units.try_into(), row_sums.try_into());
+    if let (Ok(units), Ok(row_sums)) = whole
+        && let Ok(fine_m) = <&mut [f32; 3 * PANEL_ROWS]>::try_from(&mut *fine_m)
+    {
+        for row in 0..PANEL_ROWS {
+            for axis in 0..3 {
+                fine_m[3 * row + axis] =
+                    sums[axis].0[row] * units[row] + middle[axis] * row_sums[row];
+            }
+        }
+        return;
+    }
+    for (row, (p, (unit, row_sum))) in
+        fine_m.chunks_exact_mut(3).zip(units.iter().zip(row_sums)).enumerate()
+    {
+        for (p, (sums, middle)) in p.iter_mut().zip(sums.iter().zip(middle)) {
+            *p = sums.0[row] * unit + middle * row_sum;
         }
     }
 }
@@ -330,6 +429,29 @@ fn floats(columns: &[Sums], coarse_m: &[f32], sums: &mut [Sums; 3]) {
         }
         for (sums, local) in sums.iter_mut().zip(&local) {
             sums.0[tile * TILE..][..TILE].copy_from_slice(local);
+        }
+    }
+}
+
+/// Has addresses looked up before they are come to, where that is known to help.
+fn ask_for_pages(list: &[f32]) {
+    #[cfg(target_arch = "x86_64")]
+    super::x86::ask_for_pages(list);
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = list;
+}
+
+/// Rounds positions to 16 bits of their box, two points a pair.
+fn round_positions(points: &[f32], middle: [f32; 3], half: [f32; 3], pairs: &mut [Pair<3>]) {
+    let gains = half.map(|h| STEPS / h);
+    for (at, (pair, points)) in pairs.iter_mut().zip(points.chunks(6)).enumerate() {
+        pair.at = at as u32;
+        for (axis, both) in pair.coefficients.iter_mut().enumerate() {
+            let rounded = |i: usize| {
+                let steps = points.get(i).map_or(0.0, |p| (p - middle[axis]) * gains[axis]);
+                steps.round_ties_even().clamp(-STEPS, STEPS) as i16
+            };
+            *both = packed(rounded(axis), rounded(3 + axis));
         }
     }
 }

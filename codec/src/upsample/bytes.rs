@@ -43,7 +43,7 @@ impl Counts {
     }
 
     fn check(&self) -> Result<(), UpsampleError> {
-        check_count("bits of a weight", self.bits, 12, 16)?;
+        check_count("bits of a weight", self.bits, 8, 16)?;
         check_count("coarse points", self.coarse, 3, COARSE_MAX)?;
         check_count("fine vertices", self.fine, 1, FINE_MAX)?;
         check_count("weights", self.coarse * self.fine, 1, STEPS_MAX)?;

@@ -6,6 +6,7 @@
 //! [`Parts::encode`] and [`Upsampler::decode`] are the stored form (docs/formats.md).
 
 mod bytes;
+mod rounding;
 mod run;
 
 pub use run::{Drive, Workspace};
@@ -193,7 +194,7 @@ pub struct Parts {
 /// U in steps, row after row; every row sums to 1 before rounding.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Weights {
-    /// Bits of a step in store, 12..=16.
+    /// Bits of a step in store, 8..=16.
     pub bits: u8,
     /// What a step of each row stands for; one number a fine vertex.
     pub units: Vec<f32>,
@@ -259,9 +260,9 @@ impl Weights {
     /// a row is its largest weight over `2^(bits-1) - 1`.
     ///
     /// # Errors
-    /// Other than 12..=16 bits, a weight that is not finite, no whole rows.
+    /// Other than 8..=16 bits, a weight that is not finite, no whole rows.
     pub fn round(coarse: usize, weights: &[f32], bits: u8) -> Result<Self, UpsampleError> {
-        check_count("bits of a weight", usize::from(bits), 12, 16)?;
+        check_count("bits of a weight", usize::from(bits), 8, 16)?;
         check_count("coarse points", coarse, 1, COARSE_MAX)?;
         if !weights.len().is_multiple_of(coarse) {
             return Err(UpsampleError::Invalid { what: "row of weights", index: 0 });
@@ -300,7 +301,7 @@ impl Parts {
         check_count("skinned vertices", self.skins.len(), 0, fine)?;
         check_count("modes", self.modes.len(), 0, MODES_MAX)?;
         check_count("classes", self.classes.len(), 0, CLASSES_MAX)?;
-        check_count("bits of a weight", usize::from(self.weights.bits), 12, 16)?;
+        check_count("bits of a weight", usize::from(self.weights.bits), 8, 16)?;
         self.check_coarse(coarse, fine)?;
         self.check_fine(fine)?;
         self.check_weights(coarse)

@@ -12,9 +12,10 @@ use std::hint::black_box;
 
 use codec::Basis;
 use codec::kernel::normals::{Faces, NormalsError};
-use codec::kernel::operator::{Operator, OperatorError};
+use codec::kernel::operator::Operator;
 use codec::kernel::read::{Reader, memory, read};
 use codec::kernel::{Column, Entries, Set};
+use codec::upsample::{UpsampleError, Weights};
 use codec::{AppendError, ReconstructError};
 use rand_core::Rng;
 use rand_pcg::Pcg64Mcg;
@@ -69,7 +70,7 @@ pub struct DecodeReport {
     pub faer_us: f64,
     /// A plain f32 loop, column after column, back to back.
     pub plain_us: f64,
-    /// The skirt's operator with 16-bit weights, back to back.
+    /// The skirt's operator with 8-bit weights, back to back.
     pub operator_hot_us: f64,
     /// The same, cold.
     pub operator_cold_us: f64,
@@ -77,7 +78,7 @@ pub struct DecodeReport {
     pub operator_f32_hot_us: f64,
     /// The same, cold.
     pub operator_f32_cold_us: f64,
-    /// Largest distance of the 16-bit operator's points from f64, coarse points within +-1 m (mm).
+    /// Largest distance of the 8-bit operator's points from f64, a waving sheet of 2 m (mm).
     pub operator_error_mm: f64,
 }
 
@@ -96,7 +97,7 @@ pub enum DecodeBenchError {
     Reconstruct(#[from] ReconstructError),
     /// The made-up operator was refused.
     #[error(transparent)]
-    Operator(#[from] OperatorError),
+    Operator(#[from] UpsampleError),
     /// The made-up mesh was refused.
     #[error(transparent)]
     Normals(#[from] NormalsError),
@@ -247,13 +248,51 @@ fn normals() -> Result<f64, NormalsError> {
 }
 
 struct Operators {
-    /// 16 bits hot and cold, f32 hot and cold.
+    /// 8 bits hot and cold, f32 hot and cold.
     us: [f64; 4],
     error_mm: f64,
 }
 
-/// Weights that fall with the distance to random places, rows that sum to 1, some below 0.
-fn operators(other: &[u64]) -> Result<Operators, OperatorError> {
+/// Waves of the sheet that the operator is tried on, and frames along which it is rounded.
+const WAVES: usize = 12;
+const FRAMES: u64 = 60;
+
+/// Coarse points of one frame: a square sheet of 2 m that waves.
+fn waving(frame: u64, coarse: usize) -> Vec<f32> {
+    let side = (coarse as f32).sqrt().ceil();
+    let amounts = noise(100 + frame, 3 * WAVES);
+    let point = |i: usize| {
+        let (u, v) = (i as f32 % side / side, (i as f32 / side).floor() / side);
+        let mut p = [2.0 * u - 1.0, 2.0 * v - 1.0, 0.0];
+        for (wave, amounts) in amounts.chunks(3).enumerate() {
+            let (a, b) = (1.0 + (wave % 4) as f32, (wave / 4) as f32);
+            let height = 0.1 * (2.0 * a * u + b).sin() * (1.5 * b * v + a).cos();
+            p.iter_mut().zip(amounts).for_each(|(p, amount)| *p += height * amount);
+        }
+        p
+    };
+    (0..coarse).flat_map(point).collect()
+}
+
+/// Sum of products of the points of `FRAMES` frames, from their middles.
+fn products(coarse: usize) -> Vec<f64> {
+    let mut sums = vec![0.0; coarse * coarse];
+    for frame in 1..=FRAMES {
+        let points = waving(frame, coarse);
+        for axis in 0..3 {
+            let line: Vec<f64> = points.iter().skip(axis).step_by(3).map(|x| (*x).into()).collect();
+            let mean = line.iter().sum::<f64>() / coarse as f64;
+            for (row, a) in sums.chunks_mut(coarse).zip(&line) {
+                row.iter_mut().zip(&line).for_each(|(s, b)| *s += (a - mean) * (b - mean));
+            }
+        }
+    }
+    sums
+}
+
+/// Weights that fall with the distance to random places, rows that sum to 1, some below 0; rounded as
+/// a client holds them, along sixty frames of a waving sheet, and applied to another frame of it.
+fn operators(other: &[u64]) -> Result<Operators, UpsampleError> {
     let [fine, coarse] = OPERATOR;
     let mut weights = noise(11, fine * coarse);
     for row in weights.chunks_mut(coarse) {
@@ -261,17 +300,19 @@ fn operators(other: &[u64]) -> Result<Operators, OperatorError> {
         let more = (1.0 - row.iter().sum::<f32>()) / coarse as f32;
         row.iter_mut().for_each(|w| *w += more);
     }
-    let points = noise(12, 3 * coarse);
+    let points = waving(0, coarse);
     let mut out = vec![0.0; 3 * fine];
-    let whole = Operator::quantised(fine, coarse, &weights)?;
+    let rounded = Weights::round_along(coarse, &weights, 8, &products(coarse))?;
+    let ones = vec![1.0; fine];
+    let whole = Operator::from_steps(coarse, &rounded.steps, rounded.units, ones)?;
     let float = Operator::float(fine, coarse, &weights)?;
     let mut us = [0.0; 4];
     for (us, (operator, other)) in
         us.iter_mut().zip([(&whole, &[][..]), (&whole, other), (&float, &[][..]), (&float, other)])
     {
-        *us = time(other, || operator.apply(&points, &mut out))?;
+        *us = time(other, || operator.apply(&points, &mut out).map_err(UpsampleError::from))?;
     }
-    whole.apply(&points, &mut out)?;
+    whole.apply(&points, &mut out).map_err(UpsampleError::from)?;
     let mut error_m = 0.0f64;
     for (row, found) in weights.chunks(coarse).zip(out.chunks(3)) {
         let error = |axis: usize| {

@@ -1,12 +1,14 @@
 //! The real character as coarse cloth sees it: capsules on bones (Kavan et al. 2011, section 6).
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use cloth::coarse::Capsule;
 use cloth::{Body, Pose, Rigid, Vec3};
 
 use super::scene::smooth;
 use crate::import::character::{Character, CharacterError, Clip, read_character};
+use crate::import::transition::{self, Transition};
 
 /// Poses a second of the clips.
 const RATE: f32 = 30.0;
@@ -53,13 +55,11 @@ struct Part {
     radius: f32,
 }
 
-/// A part of a clip.
-#[derive(Debug, Clone, Copy)]
+/// What a character does: clips one after the other.
+#[derive(Debug, Clone)]
 pub struct Passage {
-    /// Its clip.
-    pub clip: &'static str,
-    /// First frame.
-    pub from: usize,
+    /// Pose after pose.
+    pub poses: Arc<[Pose]>,
     /// Joint that carries the pins.
     pub carrier: &'static str,
     /// Joints whose capsules the cloth does not meet, as games do it: an arm that gets between
@@ -130,6 +130,32 @@ impl Figure {
         Ok(Self { body, clips, capsules, waist, neck, half })
     }
 
+    /// Clips one after the other, in one world: each begins where the one before ends, and what
+    /// separates them decays over ten frames, as in a motion graph.
+    ///
+    /// # Errors
+    /// A clip that is not there.
+    pub fn poses(&self, clips: &[&'static str]) -> Result<Arc<[Pose]>, FigureError> {
+        let clip = |name: &&'static str| {
+            let found = self.clips.iter().find(|c| c.name == *name);
+            found.cloned().ok_or(FigureError::Missing(name))
+        };
+        let clips = clips.iter().map(clip).collect::<Result<Vec<Clip>, FigureError>>()?;
+        let tracks = transition::tracks(&self.body.skeleton, &clips);
+        let mut poses = clips.first().map(|c| c.poses.clone()).unwrap_or_default();
+        let mut into = Rigid::IDENTITY;
+        for to_clip in 1..clips.len() {
+            let from_clip = to_clip - 1;
+            let from_frame = clips[from_clip].poses.len() - 1;
+            let cut = Transition { from_clip, from_frame, to_clip, to_frame: 0, distance_m: 0.0 };
+            let run = transition::run(&clips, &tracks, &cut);
+            into = into.after(&run.fit.alignment());
+            let rest = &clips[to_clip].poses[run.joins..];
+            poses.extend(run.poses.iter().chain(rest).map(|pose| pose.moved(&into)));
+        }
+        Ok(poses.into())
+    }
+
     /// Half axes of the waistband: to the side and to the front (m).
     pub fn waist_axes(&self) -> [f32; 2] {
         self.half
@@ -163,16 +189,15 @@ impl Figure {
     }
 
     fn pose(&self, passage: &Passage, t: f32, lead: f32) -> Pose {
-        let rest = self.body.skeleton.rest_pose();
-        let Some(clip) = self.clips.iter().find(|c| c.name == passage.clip) else { return rest };
-        let last = clip.poses.len() - 1;
+        let Some(first) = passage.poses.first() else { return self.body.skeleton.rest_pose() };
         if t < 0.0 {
-            let first = &clip.poses[passage.from.min(last)];
+            let rest = self.body.skeleton.rest_pose();
             return rest.interpolate(first, smooth((t + lead) / (0.67 * lead)));
         }
-        let frame = t * RATE + passage.from as f32;
+        let last = passage.poses.len() - 1;
+        let frame = t * RATE;
         let before = (frame as usize).min(last);
-        let (from, to) = (&clip.poses[before], &clip.poses[(before + 1).min(last)]);
+        let (from, to) = (&passage.poses[before], &passage.poses[(before + 1).min(last)]);
         from.interpolate(to, (frame - before as f32).clamp(0.0, 1.0))
     }
 }

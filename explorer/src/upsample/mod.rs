@@ -6,7 +6,7 @@
 //! smoothest functions of a mesh; [`run`] tracked simulation; [`cache`] results in the work
 //! folder; [`data`] frames as matrices; [`fit`] the paper's operators; [`tune`] their parameters;
 //! [`modes`] oscillatory modes; [`beyond`] what the paper leaves open; [`judge`] errors; [`mod@learn`] a
-//! scene from its name to an operator; [`report`] all methods side by side.
+//! scene from its name to an operator; [`stored`] U as a client holds it; [`report`] all methods side by side.
 
 pub mod beyond;
 pub mod cache;
@@ -21,6 +21,7 @@ pub mod patch;
 pub mod report;
 pub mod run;
 pub mod scene;
+pub mod stored;
 pub mod tune;
 
 pub use learn::{Learned, learn};

@@ -1,8 +1,5 @@
 //! `toile upsample report`: every method on every motion of a scene, and what they cost.
 
-use std::time::Instant;
-
-use codec::kernel::operator::Operator;
 use faer::{Mat, MatRef};
 use serde::Serialize;
 
@@ -13,14 +10,11 @@ use super::judge::{Errors, Judge};
 use super::learn::{LearnError, Lesson};
 use super::modes::{Mode, with_modes};
 use super::patch;
+use super::stored::Rounding;
 use crate::cpu::CpuClock;
 
-/// Calls of the operator that are timed, with its weights in cache and out of it.
-const CALLS: [usize; 2] = [200, 15];
 /// Ways of going beyond the paper.
 const BEYOND: [&str; 4] = ["harmonic-lift", "sparse", "history", "blended"];
-/// Read between two calls so that nothing of the operator is left in a cache (bytes).
-const EVICT_BYTES: usize = 128 << 20;
 
 /// What a scene came to.
 #[derive(Debug, Clone, Serialize)]
@@ -43,13 +37,15 @@ pub struct Report {
     pub learn_s: f64,
     /// Processor time to learn it again after a change of the profile (s).
     pub refit_s: f64,
-    /// Time of U p with U in cache, in 16 bits (us, median).
+    /// Bits of a weight of U as a client holds it.
+    pub bits: u8,
+    /// Time of U p with U in cache, as a client holds it (us, median).
     pub apply_hot_us: f64,
     /// Time of U p with U in memory (us, median).
     pub apply_cold_us: f64,
     /// Time of a coarse step of the training motion (us, median).
     pub coarse_step_us: f64,
-    /// U as a client holds it, in 16 bits (bytes).
+    /// U as a client holds it (bytes).
     pub memory_bytes: usize,
     /// Largest residual of the tracking constraint in all motions (mm).
     pub tracking_residual_mm: f64,
@@ -59,7 +55,7 @@ pub struct Report {
     pub partition_of_unity: f64,
     /// Pairs of oscillatory modes: frequency (Hz) and share explained.
     pub modes: Vec<[f64; 2]>,
-    /// What rounding of U costs on the training motion.
+    /// What rounding of U costs.
     pub rounding: Vec<Rounding>,
     /// Training motion first.
     pub motions: Vec<MotionReport>,
@@ -80,17 +76,6 @@ pub struct Parameters {
     pub harmonic_lift: [f64; 3],
     /// gamma of the sparse operator.
     pub sparse: f64,
-}
-
-/// What a number of bits costs.
-#[derive(Debug, Clone, Copy, Serialize)]
-pub struct Rounding {
-    /// Bits of a weight.
-    pub bits: u8,
-    /// Root mean square distance from the unrounded operator (mm).
-    pub rms_mm: f64,
-    /// Largest one (mm).
-    pub max_mm: f64,
 }
 
 /// Errors on one motion.
@@ -263,10 +248,11 @@ impl Lesson {
             harmonics_s: self.time_harmonics()?,
             learn_s,
             refit_s,
-            apply_hot_us: cost.0,
-            apply_cold_us: cost.1,
+            bits: cost.bits,
+            apply_hot_us: cost.hot_us,
+            apply_cold_us: cost.cold_us,
             coarse_step_us: self.coarse_step_us,
-            memory_bytes: cost.2,
+            memory_bytes: cost.bytes,
             tracking_residual_mm: 1e3 * self.residual_m,
             parameters,
             partition_of_unity: unity(harmonic.as_ref()),
@@ -302,51 +288,6 @@ impl Lesson {
         Ok(self.frames.iter().enumerate().map(one).collect())
     }
 
-    /// Median time of a method on a frame (us), as a game would apply it: what has few weights a row
-    /// as a sparse matrix, what is dense in 16 bits.
-    fn time(&self, method: &Method) -> Result<f64, LearnError> {
-        match method {
-            Method::Linear(operator) => {
-                let rows: Vec<Vec<(usize, f32)>> = (0..operator.nrows())
-                    .map(|i| {
-                        let all = (0..operator.ncols()).map(|j| (j, operator[(i, j)]));
-                        all.filter(|(_, w)| *w != 0.0).collect()
-                    })
-                    .collect();
-                if 2 * rows.iter().map(Vec::len).sum::<usize>()
-                    > operator.nrows() * operator.ncols()
-                {
-                    return Ok(self.cost(operator)?.0);
-                }
-                Ok(median(|| {
-                    let frame = &self.training().coarse;
-                    let point = |j: usize| [0, 1, 2].map(|a| frame[(j, a)] as f32);
-                    let points: Vec<[f32; 3]> = (0..operator.ncols()).map(point).collect();
-                    let sum = |row: &Vec<(usize, f32)>| {
-                        row.iter().fold([0.0f32; 3], |mut sum, (j, w)| {
-                            (0..3).for_each(|a| sum[a] += w * points[*j][a]);
-                            sum
-                        })
-                    };
-                    rows.iter().map(sum).collect::<Vec<[f32; 3]>>()
-                }))
-            }
-            Method::History(operator) => Ok(self.cost(operator)?.0),
-            Method::Modes(operator, modes) => {
-                let frame = operator * narrow(self.training().part(0, 1).coarse.as_ref());
-                let triangles = self.scene.fine.mesh.triangles();
-                Ok(self.cost(operator)?.0 + median(|| with_modes(&frame, modes, triangles)))
-            }
-            Method::Blended(blend) => {
-                let mut sum = 0.0;
-                for operator in blend.operators() {
-                    sum += self.cost(operator)?.0;
-                }
-                Ok(sum)
-            }
-        }
-    }
-
     /// What learning again from each of the other motions would bring, and who comes near it.
     fn retraining(
         &self,
@@ -375,75 +316,11 @@ impl Lesson {
         Ok(out)
     }
 
-    /// Time of U p hot and cold (us), and its bytes.
-    fn cost(&self, operator: &Mat<f32>) -> Result<(f64, f64, usize), LearnError> {
-        let weights = rows(operator.as_ref());
-        let packed = Operator::quantised(operator.nrows(), operator.ncols(), &weights)?;
-        let frames = self.training();
-        let coarse: Vec<f32> = (0..operator.ncols())
-            .flat_map(|i| (0..3).map(move |a| (i % frames.points, a)))
-            .map(|(i, a)| frames.coarse[(i, a)] as f32)
-            .collect();
-        let mut fine = vec![0.0; 3 * operator.nrows()];
-        let other = vec![1u64; EVICT_BYTES / 8];
-        let mut medians = [0.0; 2];
-        for (cold, median) in medians.iter_mut().enumerate() {
-            let mut times = Vec::new();
-            for _ in 0..CALLS[cold] {
-                if cold == 1 {
-                    std::hint::black_box(other.iter().sum::<u64>());
-                }
-                let start = Instant::now();
-                packed.apply(&coarse, &mut fine)?;
-                times.push(start.elapsed().as_secs_f64());
-            }
-            times.sort_by(f64::total_cmp);
-            *median = 1e6 * times[times.len() / 2];
-        }
-        Ok((medians[0], medians[1], packed.resident_bytes()))
-    }
-
-    fn rounding(&self, operator: &Mat<f32>) -> Result<Vec<Rounding>, LearnError> {
-        let positions = narrow(self.training().coarse.as_ref());
-        let exact = operator * &positions;
-        let mut out = Vec::new();
-        for bits in [12, 13, 14, 16] {
-            let (m, n) = (operator.ncols(), operator.nrows());
-            let packed = codec::upsample::Weights::round(m, &rows(operator.as_ref()), bits)?;
-            let rounded =
-                Mat::from_fn(n, m, |i, j| f32::from(packed.steps[i * m + j]) * packed.units[i]);
-            let off = rounded * &positions - &exact;
-            let (mut sum, mut most) = (0.0f64, 0.0f64);
-            for c in (0..off.ncols()).step_by(3) {
-                for i in 0..n {
-                    let square: f64 = (c..c + 3).map(|c| f64::from(off[(i, c)]).powi(2)).sum();
-                    sum += square;
-                    most = most.max(square);
-                }
-            }
-            let rms_mm = 1e3 * (sum / (n * off.ncols() / 3) as f64).sqrt();
-            out.push(Rounding { bits, rms_mm, max_mm: 1e3 * most.sqrt() });
-        }
-        Ok(out)
-    }
-
     /// The barycentric lift as a matrix.
     pub fn barycentric(&self) -> Mat<f32> {
         let lift = self.scene.coarse.lift(&self.scene.fine);
         matrix(&patch::dense(&lift, self.scene.coarse.count()), self.scene.coarse.count())
     }
-}
-
-/// Median time of a call (us).
-fn median<T>(mut call: impl FnMut() -> T) -> f64 {
-    let one = |_| {
-        let start = Instant::now();
-        std::hint::black_box(call());
-        1e6 * start.elapsed().as_secs_f64()
-    };
-    let mut times: Vec<f64> = (0..CALLS[0]).map(one).collect();
-    times.sort_by(f64::total_cmp);
-    times[times.len() / 2]
 }
 
 /// Row after row.

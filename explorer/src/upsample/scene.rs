@@ -99,8 +99,8 @@ impl Scene {
         match name {
             "flag" => Ok(flag()?),
             "curtain" => Ok(curtain()?),
-            "skirt" => Ok(skirt(&Arc::new(Figure::load()?))?),
-            "cape" => Ok(cape(&Arc::new(Figure::load()?))?),
+            "skirt" => skirt(&Arc::new(Figure::load()?)),
+            "cape" => cape(&Arc::new(Figure::load()?)),
             other => Err(SceneError::Unknown(other.into())),
         }
     }
@@ -204,6 +204,24 @@ fn liberties(compression: f32, expansion_m: f32) -> Settings {
 /// What skirts and capes do not meet.
 const ARMS: [&str; 4] = ["LeftForeArm", "RightForeArm", "LeftArm", "RightArm"];
 
+/// What both are learnt from: all that is walking.
+const WALKS: [&str; 4] = ["walk_figure8", "turn_left", "walk_backward", "sidestep"];
+
+/// A character's motions: name, clips, frames.
+fn motions(
+    figure: &Arc<Figure>,
+    lead_in: usize,
+    carrier: &'static str,
+    all: [(&'static str, &[&'static str], usize); 3],
+) -> Result<Vec<Motion>, FigureError> {
+    let one = |(name, clips, frames)| {
+        let passage = Passage { poses: figure.poses(clips)?, carrier, ignored: &ARMS };
+        let frames = passage.poses.len().min(frames);
+        Ok(Motion { name, frames, lead_in, drive: Drive::Character(figure.clone(), passage) })
+    };
+    all.into_iter().map(one).collect()
+}
+
 /// A coarse mesh cannot fold as finely as its cloth would: so much stiffer against bending, its folds
 /// are as wide as its triangles, and it does not fold through itself.
 fn coarse(fine: Material, stiffer: f32) -> Material {
@@ -232,9 +250,9 @@ fn flag() -> Result<Scene, MeshError> {
         settings: liberties(0.5, 0.0),
         frame_s: 1.0 / 60.0,
         motions: vec![
-            wind("constant wind", 400, 4.0, 2.1, 0.0, 0.0),
-            wind("strong wind", 200, 6.5, 1.3, 0.25, 0.0),
-            wind("moving pole", 200, 4.0, 2.1, 0.0, 1.0),
+            wind("constant wind", 1386, 4.0, 2.1, 0.0, 0.0),
+            wind("strong wind", 400, 6.5, 1.3, 0.25, 0.0),
+            wind("moving pole", 400, 4.0, 2.1, 0.0, 1.0),
         ],
     })
 }
@@ -257,9 +275,9 @@ fn curtain() -> Result<Scene, MeshError> {
         settings: liberties(0.5, 0.02),
         frame_s: 1.0 / 60.0,
         motions: vec![
-            thrown("object passing", 420, passing(0.18, 4.0)),
-            thrown("larger object", 200, passing(0.3, 3.3)),
-            thrown("thrown balls", 200, Thrown::Balls),
+            thrown("object passing", 1490, passing(0.18, 4.0)),
+            thrown("larger object", 400, passing(0.3, 3.3)),
+            thrown("thrown balls", 400, Thrown::Balls),
         ],
     })
 }
@@ -280,19 +298,10 @@ fn cone(
     }
 }
 
-fn skirt(figure: &Arc<Figure>) -> Result<Scene, MeshError> {
+fn skirt(figure: &Arc<Figure>) -> Result<Scene, SceneError> {
     let material = Material { friction: 0.2, ..Material::default() };
     let at = cone(Vec3::new(0.0, 0.95, figure.waist.z), figure.waist_axes(), TAU / 2.0, 0.62, 0.58);
     let waist = |_: usize, j: usize| j == 0;
-    let clip = |name, clip, from, frames| Motion {
-        name,
-        frames,
-        lead_in: 60,
-        drive: Drive::Character(
-            figure.clone(),
-            Passage { clip, from, carrier: "Hips", ignored: &ARMS },
-        ),
-    };
     Ok(Scene {
         name: "skirt",
         coarse: Patch::new([28, 6], true, &at, waist)?,
@@ -303,27 +312,19 @@ fn skirt(figure: &Arc<Figure>) -> Result<Scene, MeshError> {
         environment: surroundings(),
         settings: liberties(0.3, 0.02),
         frame_s: 1.0 / 30.0,
-        motions: vec![
-            clip("walk", "walk_figure8", 0, 400),
-            clip("dance", "dance_whirl", 0, 296),
-            clip("hops", "hop", 0, 180),
-        ],
+        motions: motions(
+            figure,
+            60,
+            "Hips",
+            [("walk", &WALKS, 1073), ("dance", &["dance_whirl"], 297), ("hops", &["hop"], 300)],
+        )?,
     })
 }
 
-fn cape(figure: &Arc<Figure>) -> Result<Scene, MeshError> {
+fn cape(figure: &Arc<Figure>) -> Result<Scene, SceneError> {
     let material = Material { friction: 0.2, ..Material::default() };
     let at = cone(figure.neck, [0.13, 0.11], 1.3, 0.75, 0.95);
     let neck = |_: usize, j: usize| j == 0;
-    let clip = |name, clip, from, frames| Motion {
-        name,
-        frames,
-        lead_in: 75,
-        drive: Drive::Character(
-            figure.clone(),
-            Passage { clip, from, carrier: "Spine1", ignored: &ARMS },
-        ),
-    };
     Ok(Scene {
         name: "cape",
         coarse: Patch::new([13, 6], false, &at, neck)?,
@@ -334,11 +335,16 @@ fn cape(figure: &Arc<Figure>) -> Result<Scene, MeshError> {
         environment: surroundings(),
         settings: liberties(0.5, 0.03),
         frame_s: 1.0 / 30.0,
-        motions: vec![
-            clip("walk", "walk_figure8", 0, 360),
-            clip("run", "run_figure8", 0, 200),
-            clip("kicks", "front_kick", 0, 180),
-        ],
+        motions: motions(
+            figure,
+            75,
+            "Spine1",
+            [
+                ("walk", &WALKS, 905),
+                ("run", &["run_figure8"], 244),
+                ("kicks", &["front_kick"], 300),
+            ],
+        )?,
     })
 }
 

@@ -60,6 +60,11 @@ impl Samples {
         (line / 3) * BLOCKS / (self.lines() / 3).max(1) == block
     }
 
+    /// `X^T X`.
+    pub(super) fn products(&self) -> Vec<f64> {
+        self.gram(|_| true)
+    }
+
     /// `X^T X` over the lines that `keep` names.
     fn gram(&self, keep: impl Fn(usize) -> bool) -> Vec<f64> {
         let m = self.coarse;

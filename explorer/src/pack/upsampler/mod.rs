@@ -30,7 +30,7 @@ const STATES_MAX: usize = 600;
 /// Fewer tell nothing.
 const STATES_MIN: usize = 20;
 /// Bits of a weight in store.
-const BITS: u8 = 14;
+const BITS: u8 = 8;
 /// A coarse point that follows the skin by more than this is led by it.
 const PINNED_SHARE: f32 = 0.5;
 
@@ -149,7 +149,7 @@ pub fn learn(
         classes: classes(scene),
         rms_m: 0.0,
         max_m: 0.0,
-        weights: Weights::round(points.len(), &fitted.weights, BITS)?,
+        weights: Weights::round_along(points.len(), &fitted.weights, BITS, &samples.products())?,
     };
     let stored_m = measure(scene, &data, &parts)?;
     [parts.rms_m, parts.max_m] = stored_m;
