@@ -157,6 +157,14 @@ impl Resident {
         Some(TierColumns { columns: &region.by_energy[..kept], error_m: errors_m[tier] })
     }
 
+    /// The shortest tier of a state whose stated error is at most `error_m`; empty columns where all are needed
+    /// or nothing is stated.
+    pub fn tier_within(&self, state: StateId, error_m: f32) -> TierColumns<'_> {
+        let all = TierColumns { columns: &[], error_m: 0.0 };
+        let tiers = TIERS.iter().filter_map(|columns| self.tier(state, *columns));
+        tiers.into_iter().find(|tier| tier.error_m <= error_m).unwrap_or(all)
+    }
+
     /// Largest vertex error (m) of a state of which only the leading columns are known so far.
     pub fn leading_error_m(&self, state: StateId) -> Option<f32> {
         self.find(state)?.leading_error_m
@@ -350,6 +358,8 @@ mod tests {
         assert_eq!(tier(64).columns.len(), 60);
         assert_eq!((tier(129).columns.len(), tier(129).error_m), (0, 0.0));
         assert_eq!(resident.tier(StateId(9), 16), None);
+        let within = |error_m| resident.tier_within(StateId(1), error_m).columns.len();
+        assert_eq!([0.04, 0.039, 0.03, 0.01].map(within), [16, 32, 32, 60]);
     }
 
     #[test]

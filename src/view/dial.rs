@@ -1,4 +1,7 @@
 //! The dial: how many columns of the basis a given error asks for, and what they cost.
+//!
+//! Every region states what its shorter lists of columns cost. A client that is allowed an error takes,
+//! region by region, the shortest list that keeps within it.
 
 use std::time::Instant;
 
@@ -6,91 +9,78 @@ use anyhow::Result;
 use client_lib::{Character, Histogram, PoseId};
 use serde::Serialize;
 
-/// States on which the error of leaving columns out is measured, spread over the poses.
-const SAMPLES: usize = 16;
-/// Ranks that are tried beside all columns: a factor of about 1.4 apart.
-const RANKS: [usize; 14] = [4, 6, 8, 12, 16, 24, 32, 50, 70, 100, 140, 200, 280, 400];
+/// States that stand for all, spread over the poses.
+const SAMPLES: usize = 64;
+/// Columns of the tiers; behind them come all columns.
+const TIERS: [usize; 4] = [16, 32, 64, 128];
 
-/// What a number of columns means, measured.
-#[derive(Debug, Clone, Copy, Serialize)]
-pub struct Point {
-    /// Leading columns that are decoded.
-    pub columns: usize,
-    /// Largest distance of any vertex from all columns (mm).
-    pub max_mm: f32,
-    /// Root mean square of the same (mm).
-    pub rms_mm: f32,
-    /// Median time of decoding one frame (ms).
-    pub decode_ms: f64,
-    /// Coefficients as they are stored, at the scene's rate (kB/s).
-    pub kb_s: f64,
+/// What the tiers of a version state, and what they cost here.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Tiers {
+    /// Columns of each tier, at last all.
+    columns: Vec<usize>,
+    /// Median time of decoding a frame with each (ms).
+    decode_ms: Vec<f64>,
+    /// Part of the basis that each reads at the scene's rate (MB/s).
+    read_mb_s: Vec<f64>,
+    /// Stated errors of each tier but the last, for states spread over the poses (mm).
+    stated_mm: Vec<Vec<f32>>,
+    /// Coefficients that are streamed for cloth never seen before (kB/s): regions come whole.
+    kb_s: f64,
 }
 
-/// The curve for a character's version, from few columns to all.
+/// The tiers of a character's version; without any where its publisher states none.
 ///
-/// Cost: about 16 decodings for each of 15 points.
-pub fn curve(character: &Character) -> Result<Vec<Point>> {
+/// Cost: 64 decodings for each of five tiers.
+///
+/// # Errors
+/// A basis that cannot be applied; no version that was taken up has one.
+pub fn tiers(character: &Character) -> Result<Tiers> {
     let version = character.version();
     let (basis, scene) = (version.basis(), version.scene());
     let (rows, all) = (basis.rows(), basis.columns());
     let poses = scene.pose_count();
-    let mut states = Vec::new();
-    for sample in 0..SAMPLES {
-        let pose = PoseId((sample * poses / SAMPLES) as u32);
-        let mut coefficients = vec![0.0; all];
+    let count = TIERS.iter().filter(|columns| **columns < all).count();
+    let mut spent_ms = vec![Histogram::default(); count + 1];
+    let (mut coefficients, mut out) = (vec![0.0; all], vec![0.0f32; rows]);
+    let mut stated_mm = Vec::new();
+    for sample in 0..SAMPLES.min(poses) {
+        let pose = PoseId((sample * poses / SAMPLES.min(poses)) as u32);
         let here = version.links().interior(pose).iter();
-        if here.clone().any(|state| character.read(*state, &mut coefficients)) {
-            states.push(coefficients);
+        let Some(state) = here.copied().find(|s| character.read(*s, &mut coefficients)) else {
+            continue;
+        };
+        let mut stated = Vec::new();
+        for (columns, spent_ms) in TIERS[..count].iter().zip(&mut spent_ms) {
+            let Some(tier) = character.tier_of(state, *columns) else { break };
+            stated.push(tier.error_m * 1e3);
+            let mut columns = tier.columns.to_vec();
+            columns.sort_unstable();
+            let start = Instant::now();
+            basis.reconstruct(&coefficients, 0..rows, &columns[..], &mut out)?;
+            spent_ms.record(start.elapsed().as_secs_f64() * 1e3);
         }
+        let start = Instant::now();
+        basis.reconstruct(&coefficients, 0..rows, all, &mut out)?;
+        spent_ms[count].record(start.elapsed().as_secs_f64() * 1e3);
+        if stated.len() == count {
+            stated_mm.push(stated);
+        }
+    }
+    if stated_mm.is_empty() {
+        return Ok(Tiers::default());
     }
     let stored: u64 = version.listing().regions.iter().map(|r| u64::from(r.chunk.bytes)).sum();
-    let count: u64 = version.listing().regions.iter().map(|r| u64::from(r.state_count)).sum();
-    let state_bytes = stored as f64 / count.max(1) as f64;
-    let (mut full, mut part) = (vec![0.0f32; rows], vec![0.0f32; rows]);
-    let mut points = Vec::new();
-    for columns in RANKS.into_iter().filter(|rank| *rank < all).chain([all]) {
-        let (mut max, mut sum, mut vertices) = (0.0f32, 0.0f64, 0usize);
-        let mut spent_ms = Histogram::default();
-        for coefficients in &states {
-            basis.reconstruct(coefficients, 0..rows, all, &mut full)?;
-            let start = Instant::now();
-            basis.reconstruct(coefficients, 0..rows, columns, &mut part)?;
-            spent_ms.record(start.elapsed().as_secs_f64() * 1e3);
-            let ((full, _), (part, _)) = (full.as_chunks::<3>(), part.as_chunks::<3>());
-            for (a, b) in full.iter().zip(part) {
-                let square: f32 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
-                max = max.max(square);
-                sum += f64::from(square);
-            }
-            vertices += full.len();
-        }
-        let share = columns as f64 / all.max(1) as f64;
-        points.push(Point {
-            columns,
-            max_mm: max.sqrt() * 1e3,
-            rms_mm: (sum / vertices.max(1) as f64).sqrt() as f32 * 1e3,
-            decode_ms: spent_ms.percentile(0.5),
-            kb_s: state_bytes * share * f64::from(scene.fps()) / 1e3,
-        });
-    }
-    Ok(points)
-}
-
-/// The fewest columns whose largest error stays below `mm`.
-pub fn columns_for(curve: &[Point], mm: f32) -> usize {
-    curve.iter().find(|point| point.max_mm <= mm).map_or(usize::MAX, |point| point.columns)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_fewest_columns_that_are_good_enough() {
-        let point =
-            |columns, max_mm| Point { columns, max_mm, rms_mm: 0.0, decode_ms: 0.0, kb_s: 0.0 };
-        let curve = [point(4, 90.0), point(8, 30.0), point(16, 5.0), point(20, 0.0)];
-        assert_eq!([100.0, 30.0, 29.0, 0.0].map(|mm| columns_for(&curve, mm)), [4, 8, 16, 20]);
-        assert_eq!(columns_for(&[], 1.0), usize::MAX);
-    }
+    let states: u64 = version.listing().regions.iter().map(|r| u64::from(r.state_count)).sum();
+    let fps = f64::from(scene.fps());
+    let columns: Vec<usize> = TIERS[..count].iter().copied().chain([all]).collect();
+    let share = |columns: &usize| *columns as f64 / all.max(1) as f64;
+    let read = basis.resident_bytes() as f64 * fps / 1e6;
+    Ok(Tiers {
+        read_mb_s: columns.iter().map(|columns| read * share(columns)).collect(),
+        decode_ms: spent_ms.iter().map(|spent_ms| spent_ms.percentile(0.5)).collect(),
+        kb_s: stored as f64 / states.max(1) as f64 * fps / 1e3,
+        columns,
+        stated_mm,
+    })
 }

@@ -122,7 +122,6 @@ pub struct Show {
     /// Connections of panes that play older versions.
     older: Vec<Arc<Client>>,
     fixed_columns: Vec<Option<usize>>,
-    curve: Vec<dial::Point>,
     dial_mm: f32,
     air: Air,
     clock: Clock,
@@ -185,7 +184,6 @@ impl Show {
             survey: None,
             older: Vec::new(),
             fixed_columns: Vec::new(),
-            curve: Vec::new(),
             dial_mm: 0.0,
             air: Air::default(),
             clock,
@@ -365,20 +363,20 @@ impl Show {
         if !Arc::ptr_eq(steering.scene(), scene) {
             *steering = Steering::new(scene, self.figures.seed);
         }
-        if self.meshes_of.is_none() || self.curve.is_empty() {
+        if self.meshes_of.is_none() {
             self.meshes_of = Some(version.number().0);
             let mesh = version.mesh();
             let bytes = wire::meshes(scene, mesh.vertex_count, &mesh.triangles);
             said.push(Said::Bytes(bytes));
         }
-        self.curve = dial::curve(lead)?;
+        let tiers = dial::tiers(lead)?;
         said.push(Said::Text(json!({
             "say": "version", "version": version.number().0, "garment": version.mesh().name,
             "vertices": version.mesh().vertex_count, "fps": scene.fps(), "clips": scene.clips(),
             "poses": scene.pose_count(), "edges": scene.edges().len(),
             "states": version.links().state_count(), "columns": version.basis().columns(),
             "rehearsed": answers::rehearse(scene, PRESSES, 1),
-            "merges": survey.merges(), "worst": survey.worst(), "curve": self.curve,
+            "merges": survey.merges(), "worst": survey.worst(), "tiers": tiers,
             "server_page": self.app.server_page, "may_tag": self.app.may_tag(),
             "stats": { "worst_mm": version.listing().stats.worst_error_m * 1e3,
                 "mean_mm": version.listing().stats.mean_error_m * 1e3,
@@ -394,13 +392,10 @@ impl Show {
     }
 
     fn set_columns(&mut self) {
-        let by_dial = if self.dial_mm > 0.0 {
-            dial::columns_for(&self.curve, self.dial_mm)
-        } else {
-            usize::MAX
-        };
         for (actor, fixed) in self.actors.iter_mut().zip(&self.fixed_columns) {
-            actor.columns = fixed.unwrap_or(by_dial);
+            actor.columns = fixed.unwrap_or(usize::MAX);
+            let allowed_mm = if fixed.is_some() { 0.0 } else { self.dial_mm };
+            actor.character.set_error_allowed(allowed_mm / 1e3);
         }
     }
 
@@ -543,7 +538,8 @@ impl Show {
             "decode_us": figures.decode_us.percentile(0.5),
             "write_us": figures.write_us.percentile(0.5),
             "characters": self.actors.len(),
-            "columns": self.actors[0].columns.min(lead.version().basis().columns()),
+            "columns": self.actors[0].columns.min(lead.active_columns()),
+            "tier_mm": lead.tier_error_m() * 1e3,
             "tags": self.app.tags(self.survey.as_ref()),
         });
         figures.decode_us = Histogram::default();

@@ -4,6 +4,7 @@
 
 mod determinism;
 mod faults;
+mod first_cloth;
 mod line;
 mod run;
 mod view;

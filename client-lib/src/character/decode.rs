@@ -56,7 +56,7 @@ impl Group {
         let each = rows.len().max(1);
         let (mut instances, mut out) = (instances, out);
         while let Some(first) = instances.first() {
-            let together = instances.iter().take_while(|c| c.shares(first)).count().max(1);
+            let together = instances.iter().take_while(|c| c.shares(first, columns)).count().max(1);
             let (now, later) = instances.split_at(together);
             let (into, rest) = out.split_at_mut((each * together).min(out.len()));
             if together > 1 {
@@ -107,12 +107,12 @@ impl Character {
         !self.free.run.shows_now && !self.free.run.shows_before
     }
 
-    /// Whether both can be decoded in one pass.
-    fn shares(&self, other: &Self) -> bool {
+    /// Whether both can be decoded in one pass: a tier beside as many leading columns as there are, too.
+    fn shares(&self, other: &Self, columns: usize) -> bool {
         let has_tier = |c: &Self| matches!(c.select(usize::MAX), Select::Only(_));
         Arc::ptr_eq(self.view.version.basis(), other.view.version.basis())
             && self.sampled.len() == other.sampled.len()
-            && has_tier(self) == has_tier(other)
+            && (columns >= self.view.version.basis().columns() || has_tier(self) == has_tier(other))
             && self.is_in_graph()
             && other.is_in_graph()
     }

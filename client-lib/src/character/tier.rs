@@ -1,14 +1,27 @@
 //! The dial: fewer columns, at an error that the publisher measured.
 
 use codec::kernel::Select;
+use codec::toile::TIERS;
+use protocol::StateId;
 
 use super::Character;
+use crate::cache::TierColumns;
+
+/// How a tier is chosen.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Choice {
+    /// All columns.
+    All,
+    /// So many columns.
+    Columns(usize),
+    /// As few as keep within this error (m).
+    Within(f32),
+}
 
 /// Which columns are decoded.
 #[derive(Debug)]
 pub(super) struct Active {
-    /// Columns of a tier; `usize::MAX`: all.
-    tier: usize,
+    choice: Choice,
     /// What is decoded in this frame, ascending; empty: everything.
     columns: Vec<u16>,
     /// Those of the state shown, now and in the frame before.
@@ -21,7 +34,7 @@ pub(super) struct Active {
 impl Default for Active {
     fn default() -> Self {
         let (columns, own, energies) = Default::default();
-        Self { tier: usize::MAX, columns, own, energies, error_m: 0.0 }
+        Self { choice: Choice::All, columns, own, energies, error_m: 0.0 }
     }
 }
 
@@ -33,7 +46,21 @@ impl Character {
     /// What it costs is stated by the publisher and is part of [`Character::shown_error_m`]. A
     /// garment of a profile without tiers is decoded whole.
     pub fn set_tier(&mut self, columns: usize) {
-        self.active.tier = columns;
+        self.active.choice =
+            if columns > TIERS[TIERS.len() - 1] { Choice::All } else { Choice::Columns(columns) };
+    }
+
+    /// Decodes as few columns as keep within an error (m): region by region the shortest tier whose stated
+    /// error is not above it, else all of them; 0 means all. Otherwise as [`Character::set_tier`], which
+    /// this replaces.
+    pub fn set_error_allowed(&mut self, error_m: f32) {
+        self.active.choice = if error_m > 0.0 { Choice::Within(error_m) } else { Choice::All };
+    }
+
+    /// The tier of so many columns for a state and what it costs; `None` where the state is not resident or its
+    /// publisher states no tiers.
+    pub fn tier_of(&self, state: StateId, columns: usize) -> Option<TierColumns<'_>> {
+        self.view.resident.tier(state, columns)
     }
 
     /// The stated error of the tier for what is shown (m): the largest distance of any vertex of
@@ -61,13 +88,17 @@ impl Character {
     /// Chooses the columns of this frame, after it was composed.
     pub(super) fn choose_columns(&mut self) {
         let shown = self.shown_state();
-        let Active { tier, columns, own, energies, error_m } = &mut self.active;
+        let Active { choice, columns, own, energies, error_m } = &mut self.active;
         columns.clear();
         own.swap(0, 1);
         own[0].clear();
         *error_m = 0.0;
-        let stated = shown.filter(|_| *tier != usize::MAX);
-        let stated = stated.and_then(|state| self.view.resident.tier(state, *tier));
+        let resident = &self.view.resident;
+        let stated = shown.and_then(|state| match *choice {
+            Choice::All => None,
+            Choice::Columns(columns) => resident.tier(state, columns),
+            Choice::Within(error_m) => Some(resident.tier_within(state, error_m)),
+        });
         let Some(stated) = stated.filter(|stated| !stated.columns.is_empty()) else { return };
         *error_m = stated.error_m;
         own[0].extend_from_slice(stated.columns);
@@ -80,7 +111,7 @@ impl Character {
             let offset_m = (now - base) * maximum;
             (offset_m != 0.0).then_some((offset_m * offset_m, column))
         }));
-        let kept = energies.len().min(*tier);
+        let kept = energies.len().min(stated.columns.len());
         if kept > 0 {
             energies.select_nth_unstable_by(kept - 1, |a, b| b.0.total_cmp(&a.0));
             columns.extend(energies[..kept].iter().map(|(_, column)| *column));
@@ -135,5 +166,11 @@ mod tests {
         character.set_tier(129);
         character.step(PoseId(1));
         assert_eq!((character.active_columns(), character.tier_error_m()), (2, 0.0));
+        let mut character = enter();
+        for (allowed_m, stated_m) in [(0.03, 0.03), (0.029, 0.02), (0.005, 0.0), (0.0, 0.0)] {
+            character.set_error_allowed(allowed_m);
+            character.place(StateId(1));
+            assert!((character.tier_error_m() - stated_m).abs() < 1e-6, "{allowed_m}");
+        }
     }
 }

@@ -31,6 +31,12 @@ impl From<usize> for Select<'_> {
     }
 }
 
+impl<'a> From<&'a [u16]> for Select<'a> {
+    fn from(numbers: &'a [u16]) -> Self {
+        Self::Only(numbers)
+    }
+}
+
 impl Select<'_> {
     fn has(&self, number: usize) -> bool {
         match self {

@@ -248,12 +248,24 @@ class Panels {
     const mm = this.allowed();
     at("dialled").value = mm ? `${mm.toFixed(mm < 10 ? 1 : 0)} mm` : "none";
     if (tell) this.send({ do: "dial", mm });
-    const curve = this.version ? this.version.curve : [];
-    if (!curve.length) return;
-    const point = curve.find(p => mm > 0 && p.max_mm <= mm) || curve[curve.length - 1];
-    at("dial-cost").textContent = `${point.columns} of ${this.version.columns} columns: at most `
-      + `${point.max_mm.toFixed(1)} mm (RMS ${point.rms_mm.toFixed(2)}) from all of them, `
-      + `${point.kb_s.toFixed(1)} kB/s new cloth, ${point.decode_ms.toFixed(3)} ms a frame`;
+    const tiers = this.version ? this.version.tiers : null;
+    if (!tiers) return;
+    at("dial").disabled = !tiers.columns.length;
+    if (!tiers.columns.length) {
+      at("dial-cost").textContent = "the cloth of this store states no tiers";
+      return;
+    }
+    // Region by region the shortest tier that keeps within the error, over states spread over the poses.
+    const last = tiers.columns.length - 1;
+    const taken = tiers.stated_mm.map(stated => {
+      const found = mm > 0 ? stated.findIndex(error => error <= mm) : -1;
+      return found < 0 ? last : found;
+    });
+    const mean = values => taken.reduce((sum, tier) => sum + values[tier], 0) / taken.length;
+    const stated = Math.max(0, ...taken.map((tier, i) => tier < last ? tiers.stated_mm[i][tier] : 0));
+    at("dial-cost").textContent = `${mean(tiers.columns).toFixed(0)} of ${this.version.columns} columns in the `
+      + `mean, stated error at most ${stated.toFixed(1)} mm: ${mean(tiers.decode_ms).toFixed(3)} ms a frame, `
+      + `${mean(tiers.read_mb_s).toFixed(0)} MB/s of basis read; ${tiers.kb_s.toFixed(1)} kB/s of new cloth, which comes whole`;
   }
 
   takeFigures(said, pageMs) {
