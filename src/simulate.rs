@@ -49,8 +49,8 @@ pub fn run(a: &args::Simulate) -> Result<()> {
     }
     let frames = a.frames.unwrap_or(if a.soak { SOAK_FRAMES } else { FRAMES });
     let recorder = Recorder::new(a.export.clone(), a.picture.clone(), frames, SHOTS)?;
-    let table = a.table.clone().map(Table::new).transpose()?;
     let mut scene = scene::load_with(&a.scene, a.vertices)?;
+    let table = a.table.clone().map(|file| Table::new(file, &scene)).transpose()?;
     start_at_clip(&mut scene, &spec);
     let (tally, failed) = simulate(a, (&spec, frames), &scene, (recorder, table))?;
     let sum = tally.sum();
@@ -112,7 +112,7 @@ fn simulate(
         tally.add(&step, &straight);
         record(&mut recorder, &straight, scene, &step)?;
         if let Some(table) = &mut table {
-            table.row(frame, &name(&straight, scene), &step)?;
+            table.row(frame, &name(&straight, scene), &step, &straight)?;
         }
         live.tell(frame + 1, || line(&tally.sum()));
     }
@@ -165,7 +165,9 @@ fn record(
     let (mut joints, mut body) = (Vec::new(), Vec::new());
     scene.body.skin(&pose, &mut joints, &mut body);
     let flag = if step.quality.frames_flagged > 0 { " FLAGGED" } else { "" };
-    let caption = format!("{}{flag}", name(straight, scene));
+    let class = straight.class();
+    let comma = if class.is_empty() { "" } else { ", " };
+    let caption = format!("{}{comma}{class}{flag}", name(straight, scene));
     let cloth = straight.world();
     recorder.keep(&meshes(scene), Shown { body, cloth: &cloth, hips: pose.root, caption })
 }

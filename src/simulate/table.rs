@@ -4,7 +4,8 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use anyhow::{Context, Result};
-use explorer::simulate::Step;
+use explorer::scene::Scene;
+use explorer::simulate::{Step, Straight};
 
 use crate::place;
 
@@ -15,18 +16,25 @@ pub struct Table {
 }
 
 impl Table {
-    /// Refuses a file that could not be written.
-    pub fn new(file: PathBuf) -> Result<Self> {
+    /// Refuses a file that could not be written. Each class rule of the scene has a column: how far
+    /// its region lies above the threshold (mm).
+    pub fn new(file: PathBuf, scene: &Scene) -> Result<Self> {
         place::ensure_writable(&file)?;
-        let text = "frame,pose,cpu_s,substeps,iterations,deep_1mm,deep_5mm,pinched,depth_max_mm,\
-                    stretch_max_pct,speed_max_m_s,crossings,retried,flagged\n";
-        Ok(Self { file, text: text.into() })
+        let mut text = String::from(
+            "frame,pose,cpu_s,substeps,iterations,deep_1mm,deep_5mm,pinched,depth_max_mm,\
+             stretch_max_pct,speed_max_m_s,crossings,retried,flagged",
+        );
+        for rule in &scene.metric.classes {
+            write!(text, ",{}_above_mm", rule.name)?;
+        }
+        text.push('\n');
+        Ok(Self { file, text })
     }
 
     /// Adds a frame.
-    pub fn row(&mut self, frame: u64, name: &str, step: &Step) -> Result<()> {
+    pub fn row(&mut self, frame: u64, name: &str, step: &Step, at: &Straight<'_>) -> Result<()> {
         let q = &step.quality;
-        writeln!(
+        write!(
             self.text,
             "{frame},{name},{:.6},{},{},{},{},{},{:.3},{:.3},{:.3},{},{},{}",
             step.cpu_s,
@@ -42,6 +50,10 @@ impl Table {
             q.frames_retried,
             q.frames_flagged
         )?;
+        for height_m in at.class_heights() {
+            write!(self.text, ",{:.1}", height_m * 1e3)?;
+        }
+        self.text.push('\n');
         Ok(())
     }
 

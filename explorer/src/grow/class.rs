@@ -82,8 +82,13 @@ impl Classifier {
 
     /// The class of a state.
     pub fn class(&self, pose: PoseId, state: &GridState) -> Class {
-        let mut class = 0;
-        for (rule, vertices) in self.regions.iter().enumerate() {
+        let sides = self.heights(pose, state).enumerate();
+        sides.fold(0, |class, (rule, height_m)| class | u8::from(height_m > 0.0) << rule)
+    }
+
+    /// How far the mean place of each rule's region lies above its plane (m), in the rules' order.
+    pub fn heights(&self, pose: PoseId, state: &GridState) -> impl Iterator<Item = f32> {
+        self.regions.iter().enumerate().map(move |(rule, vertices)| {
             let mut sum = [0i64; 3];
             for vertex in vertices {
                 let place = state.positions[*vertex as usize];
@@ -91,10 +96,8 @@ impl Classifier {
             }
             let mean = sum.map(|s| s as f32 / vertices.len().max(1) as f32 * POSITION_STEP_M);
             let (direction, offset_m) = self.planes[pose.index()][rule];
-            let above = direction.dot(Vec3::from_array(mean)) + offset_m > 0.0;
-            class |= u8::from(above) << rule;
-        }
-        class
+            direction.dot(Vec3::from_array(mean)) + offset_m
+        })
     }
 }
 

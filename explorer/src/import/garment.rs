@@ -23,10 +23,12 @@ pub struct Surface {
 /// Which vertices are held to the body where they lie in the rest pose.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Attachment {
-    /// All that are nearer to a joint than so many metres.
+    /// All that are nearer to a place than so many metres.
     Near {
-        /// Name of the joint.
+        /// Name of a joint,
         joint: String,
+        /// and how far from it the place lies in the rest pose (m).
+        offset: Vec3,
         /// Metres.
         within_m: f32,
     },
@@ -242,8 +244,8 @@ impl Surface {
             )),
         };
         match attachment {
-            Attachment::Near { joint, within_m } => {
-                let at = place(joint)?;
+            Attachment::Near { joint, offset, within_m } => {
+                let at = place(joint)? + *offset;
                 let near = |v: &u32| self.positions[*v as usize].distance(at) <= *within_m;
                 let held: Vec<u32> = (0..self.positions.len() as u32).filter(near).collect();
                 if held.is_empty() {

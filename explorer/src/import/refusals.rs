@@ -357,6 +357,7 @@ fn regions_metric_and_classes_are_resolved_or_refused_by_name() {
         ("weight = 2.0", "weight = -1.0", ["weights[0].weight", "range"]),
         ("norm = \"rms\"", "norm = \"mean\"", ["norm", "mean"]),
         ("{ loop_near = \"Head\" }", "{ near = \"Head\" }", ["garment.regions.top[0]", "within_m"]),
+        ("{ loop_near", "{ offset_m = [0.0, 1.0, 0.0], loop_near", ["regions.top[0]", "offset_m"]),
     ] {
         assert!(whole.contains(from), "{from}");
         files.write("scene.toml", whole.replacen(from, to, 1));

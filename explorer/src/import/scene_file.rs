@@ -34,7 +34,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use cloth::fabrics;
+use cloth::{Vec3, fabrics};
 use protocol::limits::NAME_BYTES_MAX;
 use serde::Deserialize;
 
@@ -184,7 +184,7 @@ pub struct LayerTable {
     pub attach: Vec<AttachTable>,
 }
 
-/// One of `loop_near`, `near` with `within_m`, `vertices`.
+/// One of `loop_near`, `near` with `within_m` (and `offset_m`), `vertices`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AttachTable {
@@ -194,6 +194,8 @@ pub struct AttachTable {
     pub near: Option<String>,
     /// ... within so many metres.
     pub within_m: Option<f32>,
+    /// The middle lies so far from the joint (m), in the rest pose; default: at the joint.
+    pub offset_m: Option<[f32; 3]>,
     /// Vertices of the file, from 0.
     pub vertices: Option<Vec<u32>>,
 }
@@ -444,20 +446,34 @@ pub(super) fn attachments(
     key: &str,
     list: &[AttachTable],
 ) -> Result<Vec<Attachment>, SceneFileError> {
-    let one = |(index, a): (usize, &AttachTable)| match (
-        &a.loop_near,
-        &a.near,
-        a.within_m,
-        &a.vertices,
-    ) {
-        (Some(joint), None, None, None) => Ok(Attachment::Loop { joint: joint.clone() }),
-        (None, Some(joint), Some(within_m), None) => {
-            Ok(Attachment::Near { joint: joint.clone(), within_m })
+    let one = |(index, a): (usize, &AttachTable)| match a {
+        AttachTable {
+            loop_near: Some(joint),
+            near: None,
+            within_m: None,
+            offset_m: None,
+            vertices: None,
+        } => Ok(Attachment::Loop { joint: joint.clone() }),
+        AttachTable {
+            loop_near: None,
+            near: Some(joint),
+            within_m: Some(within_m),
+            offset_m,
+            vertices: None,
+        } => {
+            let offset = Vec3::from_array(offset_m.unwrap_or_default());
+            Ok(Attachment::Near { joint: joint.clone(), offset, within_m: *within_m })
         }
-        (None, None, None, Some(v)) => Ok(Attachment::Vertices(v.clone())),
+        AttachTable {
+            loop_near: None,
+            near: None,
+            within_m: None,
+            offset_m: None,
+            vertices: Some(v),
+        } => Ok(Attachment::Vertices(v.clone())),
         _ => Err(value(
             &format!("{key}[{index}]"),
-            "give loop_near, or near with within_m, or vertices",
+            "give loop_near, or near with within_m (and offset_m), or vertices",
         )),
     };
     list.iter().enumerate().map(one).collect()

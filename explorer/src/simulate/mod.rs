@@ -12,6 +12,7 @@ use protocol::{EdgeId, PoseId};
 use crate::cloth_simulator::ClothSimulator;
 use crate::cpu::CpuClock;
 use crate::grid::GridState;
+use crate::grow::class::{self, Classifier};
 use crate::scene::Scene;
 use crate::simulator::{Frame, FrameQuality, SimulateError, Simulator};
 
@@ -52,6 +53,7 @@ pub struct Straight<'a> {
     place: Rigid,
     state: GridState,
     drape: FrameQuality,
+    classifier: Classifier,
 }
 
 impl<'a> Straight<'a> {
@@ -86,7 +88,9 @@ impl<'a> Straight<'a> {
     ) -> Self {
         simulator.set_refine(options.refine);
         simulator.nudge_next(Vec3::X * options.nudge_m);
-        Self { scene, simulator, pose: scene.start, place: Rigid::IDENTITY, state, drape }
+        let classifier = Classifier::new(scene);
+        let (pose, place) = (scene.start, Rigid::IDENTITY);
+        Self { scene, simulator, pose, place, state, drape, classifier }
     }
 
     /// Simulates the frame to a pose that may follow the one where the walk stands.
@@ -135,6 +139,16 @@ impl<'a> Straight<'a> {
     /// The state, in the state frame.
     pub fn state(&self) -> &GridState {
         &self.state
+    }
+
+    /// The state's class in words, e.g. `hood down`; empty where the scene has no rules.
+    pub fn class(&self) -> String {
+        class::name(&self.scene.metric.classes, self.classifier.class(self.pose, &self.state))
+    }
+
+    /// How far each rule's region lies above its threshold (m), in the scene's order.
+    pub fn class_heights(&self) -> impl Iterator<Item = f32> {
+        self.classifier.heights(self.pose, &self.state)
     }
 
     /// The garment's mesh.

@@ -45,3 +45,41 @@ fn a_pose_that_does_not_follow_is_refused() {
     let error = walk.step(scene.start).unwrap_err();
     assert!(error.0.contains("no edge"), "{error}");
 }
+
+/// Whether `robe-real`'s hood is up, after each of so many frames of a clip from its beginning.
+fn hood_up(frames: usize, clip: &str) -> Option<Vec<bool>> {
+    let data = crate::import::data_dir().filter(|d| d.join("character.glb").is_file());
+    if data.is_none() {
+        assert!(std::env::var_os("TOILE_REQUIRE_DATA").is_none(), "the data folder is missing");
+        eprintln!("skipped: needs the data folder (TOILE_DATA)");
+        return None;
+    }
+    let options = crate::import::LoadOptions { vertices: Some(900) };
+    let loaded = crate::import::load_with("robe-real", data.as_deref(), options);
+    let mut scene = loaded.unwrap().scene;
+    let primary = std::sync::Arc::clone(&scene.primary);
+    let of_clip = |id: PoseId| {
+        let pose = primary.pose(id);
+        !pose.transition && primary.clips()[usize::from(pose.clip)] == clip
+    };
+    let ids = || (0..primary.poses().len() as u32).map(PoseId);
+    scene.start = ids().filter(|id| of_clip(*id)).min_by_key(|id| primary.pose(*id).frame).unwrap();
+    let mut walk = Straight::new(&scene, Options::default()).unwrap();
+    let step = |_| {
+        let mut next = primary.out_edges(walk.pose()).map(|edge| primary.edge(edge).to);
+        walk.step(next.find(|to| of_clip(*to)).unwrap()).unwrap();
+        walk.class_heights().next().unwrap() > 0.0
+    };
+    Some((0..frames).map(step).collect())
+}
+
+#[test]
+fn the_hood_rests_on_the_head_in_a_walk_and_falls_and_stays_down_in_a_run() {
+    let Some(walked) = hood_up(40, "walk_figure8") else { return };
+    assert!(walked.iter().all(|up| *up), "the hood slid off in a walk: {walked:?}");
+    let ran = hood_up(100, "run_figure8").unwrap();
+    assert!(ran[..15].iter().all(|up| *up), "the hood was never up: {ran:?}");
+    // A stride throws it up for a frame or two, no more.
+    let up = ran[60..].iter().filter(|up| **up).count();
+    assert!(up < 12, "the hood came up again in a run: {ran:?}");
+}

@@ -75,6 +75,10 @@ fn coat(form: &Form, worn: Vec<Worn>) -> Result<Design<'_>, TailorError> {
 }
 
 /// A hooded robe with wide sleeves, to the calf, of one piece; the hood can fall.
+///
+/// The hood is a bag much wider than the head and deep behind it. Its opening runs over the crown
+/// and ends at the chin, so that only the crown holds it: once the rim has slid off, the bag's weight
+/// takes it down the back.
 fn robe(form: &Form, worn: Vec<Worn>) -> Result<Design<'_>, TailorError> {
     let (chest, ankle) = (form.joint("Spine1")?, form.joint("LeftFoot")?);
     let [low, high] = form.skin_of(&["Head"])?;
@@ -84,19 +88,17 @@ fn robe(form: &Form, worn: Vec<Worn>) -> Result<Design<'_>, TailorError> {
     let bottom = Vec3::new(0.12, ankle.y + 0.05, chest.z);
     let mut loose = mirrored(top, bottom, [0.11, 0.27]);
     loose.extend(sleeves(form, [0.075, 0.095, 0.125])?);
-    let back = Vec3::new(0.0, head.y - 0.02, head.z - 0.05);
-    let radius = half.x.max(half.z) + 0.03;
-    loose.push(cone(Vec3::new(0.0, head.y + 0.02, head.z - 0.01), back, [radius, radius]));
+    let around_head = Vec3::new(0.0, head.y + 0.03, head.z - 0.02);
+    let behind = Vec3::new(0.0, head.y - 0.05, head.z - 0.20);
+    loose.push(cone(around_head, behind, [half.x.max(half.z) + 0.06, 0.11]));
     let hem = ankle.y + 0.20;
-    let oval = move |p: Vec3| {
-        let across = (p.x / (half.x + 0.012)).powi(2);
-        let along = ((p.y - head.y + 0.005) / (half.y * 0.78)).powi(2);
-        (half.x * (1.0 - (across + along).sqrt())).min(p.z - head.z - 0.01)
-    };
+    let chin = low.y - 0.03;
+    let outward = Vec3::new(0.0, 0.3, 1.0).normalize();
+    let face = move |p: Vec3| outward.dot(p - head).min(p.y - chin);
     Ok(Design {
         name: "robe",
         shell: shell(form, worn, [0.018, 0.014], &loose),
-        cuts: vec![below_height(hem), cuff(form, 1.0)?, cuff(form, -1.0)?, Box::new(oval)],
+        cuts: vec![below_height(hem), cuff(form, 1.0)?, cuff(form, -1.0)?, Box::new(face)],
         openings: 4,
         bounds: around(form),
         cell_m: CELL_M,
