@@ -47,12 +47,14 @@ def main():
     parser.add_argument("--frames", type=int, default=3000)
     parser.add_argument("--step", type=int, default=250)
     parser.add_argument("--workers", default="1")
+    parser.add_argument("--vertices", help="of the garment; default: as the scene says")
     parser.add_argument("--out", type=pathlib.Path, required=True)
     parser.add_argument("--toile", default="toile")
     a = parser.parse_args()
     a.out.mkdir(parents=True, exist_ok=True)
     base = a.out / "base"
     explore = [a.toile, "explore", "--scene", a.scene, "--workers", a.workers, "--json"]
+    explore += ["--vertices", a.vertices] if a.vertices else []
     first = run(*explore, "--store", str(base), "--frames", "1")
     walk(a, str(base))
     print("policy,frames,best_worst_mm,visited_p95_mm,visited_mean_mm")
