@@ -2,7 +2,8 @@
 
 use glam::Vec3A;
 
-use super::{Coarse, NEAREST, Workspace, nearest};
+use super::contact::nearest;
+use super::{Coarse, NEAREST, Workspace};
 use crate::mesh::Mesh;
 
 /// A place on an edge.

@@ -89,6 +89,17 @@ impl Swept {
         (x - closest(&self.from, x).0).length() - self.radius
     }
 
+    /// How far a vertex may go from `x` (m) and still not be met, at least: 0 or less where it may be at
+    /// once. On its way a collider stays within half its travel of the segment between both ends'
+    /// middles, and a segment from `x` comes no nearer to that than it is long.
+    pub(super) fn clear(&self, x: Vec3A) -> f32 {
+        let middle = [0, 1].map(|k| (self.from[k] + self.to[k]) * 0.5);
+        let travel = [0, 1].map(|k| (self.to[k] - self.from[k]).length());
+        let far = (x - closest(&middle, x).0).length();
+        // What rounding may take from either.
+        far * (1.0 - 1e-5) - 0.5 * travel[0].max(travel[1]) - self.radius - 1e-5
+    }
+
     /// Whether a vertex that moved from `x0` to `x` was met on its way, seen from the collider: so
     /// nothing is passed through, however fast. It is led out on the side from which it came.
     pub(super) fn hit(&self, x0: Vec3A, x: Vec3A) -> Option<Hit> {
@@ -150,6 +161,32 @@ mod tests {
         assert!((out - Vec3A::from(to)).length() >= 0.1 - 1e-5);
         let beside = Vec3A::new(0.0, 0.2, 0.0);
         assert!(hit(from, to, beside, beside).is_none());
+    }
+
+    #[test]
+    fn what_stays_clear_is_never_met() {
+        let mut state = 7u32;
+        let mut chance = move || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 23) as f32 - 1.0
+        };
+        let mut point = |size: f32| Vec3::new(size * chance(), size * chance(), size * chance());
+        let mut clear = 0;
+        for _ in 0..20_000 {
+            let ends = [point(0.5), point(0.5)];
+            let moved = [ends[0] + point(0.2), ends[1] + point(0.2)];
+            let capsule = |ends| Capsule { ends, radius: 0.1 };
+            let swept =
+                Swept::new(&Moving { from: capsule(ends), to: capsule(moved) }, 0.0, Vec3A::ZERO);
+            let x0 = Vec3A::from(point(0.6));
+            let room = swept.clear(x0);
+            if room > 0.0 {
+                let way = Vec3A::from(point(1.0)).normalize_or_zero();
+                assert!(swept.hit(x0, x0 + way * (room * 0.999)).is_none());
+                clear += 1;
+            }
+        }
+        assert!(clear > 5_000, "{clear}");
     }
 
     #[test]

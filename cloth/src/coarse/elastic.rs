@@ -5,10 +5,11 @@
 //! eigenvectors: with `S = sqrt(F^T F)`, which a 2 x 2 matrix has in closed form, they are `F h(S)`
 //! for the function h that takes a stretch s to its tension over s.
 
-use glam::{Vec2, Vec3A};
+use glam::{Mat4, Vec2, Vec3A, Vec4};
 
 use crate::Material;
 use crate::mesh::Mesh;
+use crate::solver::simd::Task;
 
 const LANES: usize = 8;
 /// Over a half, or passes would overshoot and grow; less than 1, or they would creep where the cloth
@@ -51,6 +52,25 @@ impl Constants {
     }
 }
 
+/// Adds the forces (N) of all groups at positions `x` (m).
+pub(super) struct Forces<'a> {
+    pub(super) groups: &'a [Group],
+    pub(super) constants: &'a Constants,
+    pub(super) x: &'a [Vec3A],
+    pub(super) forces: &'a mut [Vec3A],
+}
+
+impl Task for Forces<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        for group in self.groups {
+            group.add_forces(self.constants, self.x, self.forces);
+        }
+    }
+}
+
 impl Group {
     pub(super) fn all(mesh: &Mesh) -> Vec<Self> {
         let count = mesh.triangles().len();
@@ -75,13 +95,18 @@ impl Group {
     }
 
     /// Adds the forces (N) at positions `x` (m).
-    pub(super) fn add_forces(&self, c: &Constants, x: &[Vec3A], forces: &mut [Vec3A]) {
+    #[inline(always)]
+    fn add_forces(&self, c: &Constants, x: &[Vec3A], forces: &mut [Vec3A]) {
         let mut f = [[[0.0f32; LANES]; 3]; 2];
         for (corners, gradients) in self.corners.iter().zip(&self.gradients) {
             let mut at = [[0.0f32; LANES]; 3];
-            for (lane, vertex) in corners.iter().enumerate() {
-                let p = x[*vertex as usize];
-                (at[0][lane], at[1][lane], at[2][lane]) = (p.x, p.y, p.z);
+            for (half, four) in corners.as_chunks::<4>().0.iter().enumerate() {
+                let [a, b, c, d] = four.map(|vertex| Vec4::from((x[vertex as usize], 0.0)));
+                // Through registers: lanes written one by one could not be read as a vector at once.
+                let turned = Mat4::from_cols(a, b, c, d).transpose();
+                for (at, axis) in at.iter_mut().zip([turned.x_axis, turned.y_axis, turned.z_axis]) {
+                    at[4 * half..][..4].copy_from_slice(&axis.to_array());
+                }
             }
             for (f, gradient) in f.iter_mut().zip(gradients) {
                 for (f, at) in f.iter_mut().zip(&at) {
@@ -99,14 +124,19 @@ impl Group {
                     force[lane] = p1[lane] * gradients[0][lane] + p2[lane] * gradients[1][lane];
                 }
             }
-            for (lane, vertex) in corners.iter().enumerate() {
-                forces[*vertex as usize] -=
-                    Vec3A::new(force[0][lane], force[1][lane], force[2][lane]);
+            for (half, four) in corners.as_chunks::<4>().0.iter().enumerate() {
+                let axis = |axis: usize| Vec4::from_slice(&force[axis][4 * half..]);
+                let turned = Mat4::from_cols(axis(0), axis(1), axis(2), Vec4::ZERO).transpose();
+                let all = [turned.x_axis, turned.y_axis, turned.z_axis, turned.w_axis];
+                for (vertex, force) in four.iter().zip(all) {
+                    forces[*vertex as usize] -= Vec3A::from_vec4(force);
+                }
             }
         }
     }
 
     /// Derivative of each triangle's energy by the columns of its deformation gradient (N m).
+    #[inline(always)]
     fn tensions(&self, c: &Constants, f: &[[[f32; LANES]; 3]; 2]) -> [[[f32; LANES]; 3]; 2] {
         let mut push = [[[0.0f32; LANES]; 3]; 2];
         for lane in 0..LANES {

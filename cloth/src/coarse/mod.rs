@@ -13,6 +13,7 @@
 
 mod between;
 mod collide;
+mod contact;
 mod elastic;
 mod envelope;
 
@@ -24,6 +25,7 @@ use crate::model::{Environment, State};
 use crate::solver::SPEED_MAX_M_S;
 use crate::solver::bending::Stiffness;
 use crate::solver::matrix::Pattern;
+use crate::solver::simd;
 use between::Sample;
 use collide::Swept;
 pub use collide::{Capsule, Moving};
@@ -126,6 +128,8 @@ pub struct Workspace {
     factor: Envelope,
     swept: Vec<Swept>,
     near: Vec<[u16; NEAREST]>,
+    /// How far each point may go from its start without meeting them (m).
+    clear: Vec<[f32; NEAREST]>,
     /// The same for places along edges.
     near_between: Vec<[u16; NEAREST]>,
     start: Vec<Vec3A>,
@@ -408,32 +412,17 @@ impl Coarse {
         ws.x.clone_from(&ws.aim);
     }
 
-    /// For each point the colliders that it may meet, nearest first.
-    fn find_near(&self, input: &Input<'_>, shift: Vec3A, ws: &mut Workspace) {
-        let offset = self.material.offset + self.settings.expansion_m;
-        ws.swept.clear();
-        ws.swept.extend(input.colliders.iter().map(|c| Swept::new(c, offset, shift)));
-        ws.near.clear();
-        ws.contacts.clear();
-        ws.contacts.resize(self.masses.len(), None);
-        for (i, place) in self.places.iter().enumerate() {
-            let x = ws.start[i];
-            // The strain limit and neighbours may carry a point further than its own aim.
-            let way = 2.0 * (ws.aim[i] - x).length() + 0.1;
-            let led = *place == usize::MAX;
-            ws.near.push(if led { [u16::MAX; NEAREST] } else { nearest(&ws.swept, x, way) });
-        }
-        self.find_near_between(ws);
-    }
-
     /// One pass: true forces, constant matrix.
     fn pass(&self, dt: f32, ws: &mut Workspace) {
         ws.forces.clear();
         ws.forces.resize(self.masses.len(), Vec3A::ZERO);
         self.bending.add_forces(&self.pattern, &ws.x, &mut ws.forces);
-        for group in &self.groups {
-            group.add_forces(&self.constants, &ws.x, &mut ws.forces);
-        }
+        simd::run(elastic::Forces {
+            groups: &self.groups,
+            constants: &self.constants,
+            x: &ws.x,
+            forces: &mut ws.forces,
+        });
         let inertia = 1.0 / (dt * dt);
         for (rhs, i) in ws.rhs.iter_mut().zip(&self.order) {
             let i = *i as usize;
@@ -442,36 +431,6 @@ impl Coarse {
         ws.factor.solve(&mut ws.rhs);
         for (dx, i) in ws.rhs.iter().zip(&self.order) {
             ws.x[*i as usize] += *dx;
-        }
-    }
-
-    fn push_out(&self, ws: &mut Workspace) {
-        let friction = self.material.friction;
-        for (i, near) in ws.near.iter().enumerate() {
-            for c in near.iter().take_while(|c| **c != u16::MAX) {
-                let swept = &ws.swept[usize::from(*c)];
-                let Some(hit) = swept.hit(ws.start[i], ws.x[i]) else { continue };
-                ws.x[i] += hit.normal * hit.depth;
-                let slip = ws.x[i] - ws.start[i] - hit.travel;
-                let slip = slip - hit.normal * hit.normal.dot(slip);
-                let most = friction * hit.depth;
-                let share = most / slip.length().max(most).max(1e-12);
-                ws.x[i] -= slip * share;
-                ws.contacts[i] = Some((hit.normal, hit.travel));
-            }
-        }
-        if self.environment.ground {
-            let least = self.material.offset;
-            for (i, x) in ws.x.iter_mut().enumerate() {
-                let depth = least - x.y;
-                if depth > 0.0 && self.places[i] != usize::MAX {
-                    let slip = (*x - ws.start[i]) * Vec3A::new(1.0, 0.0, 1.0);
-                    let most = self.environment.ground_friction * depth;
-                    *x -= slip * (most / slip.length().max(most).max(1e-12));
-                    x.y = least;
-                    ws.contacts[i] = Some((Vec3A::Y, Vec3A::ZERO));
-                }
-            }
         }
     }
 
@@ -517,25 +476,6 @@ impl Coarse {
             state.velocities[i] = (way / dt).clamp_length_max(SPEED_MAX_M_S).into();
         }
     }
-}
-
-/// The colliders nearest to `x` that something within `way` of it may meet (m), nearest first.
-fn nearest(colliders: &[Swept], x: Vec3A, way: f32) -> [u16; NEAREST] {
-    let mut near = [u16::MAX; NEAREST];
-    let mut distances = [f32::INFINITY; NEAREST];
-    for (c, swept) in colliders.iter().enumerate() {
-        if swept.misses(x, way) > 0.0 {
-            continue;
-        }
-        let distance = swept.distance(x);
-        if distance < distances[0] {
-            (distances[1], near[1]) = (distances[0], near[0]);
-            (distances[0], near[0]) = (distance, c as u16);
-        } else if distance < distances[1] {
-            (distances[1], near[1]) = (distance, c as u16);
-        }
-    }
-    near
 }
 
 /// Places of free points in the solve's order, and the order itself.

@@ -262,6 +262,51 @@ mod tests {
         assert!(apart(&training.laplacian(&laplacian, 1e-9).unwrap(), &operator) < 1e-3);
     }
 
+    /// The system of all N x M unknowns at once, as the paper states it, against one system for each
+    /// eigenvector.
+    #[test]
+    fn the_laplacian_is_that_of_the_aggregate_system() {
+        let (coarse, fine) = (sheet(2), sheet(5));
+        let rows = coarse.subdivision(&fine);
+        let (m, n) = (coarse.count(), fine.count());
+        let planted = Mat::from_fn(n, m, |i, j| rows[i * m + j]);
+        let frames = frames(&planted, 20, 0.1);
+        let laplacian = Laplacian::new(&fine.mesh);
+        let harmonics = harmonics(&fine.mesh, 12).unwrap();
+        let training = Training::new(&frames, &harmonics, 12).unwrap();
+        let (alpha, width) = (0.02, m - 1);
+        let normal = &training.normal;
+        // Unknown (vertex, direction of Z) at vertex * width + direction.
+        let mut whole = Mat::<f64>::zeros(n * width, n * width);
+        for i in 0..n {
+            for a in 0..width {
+                for b in 0..width {
+                    whole[(i * width + a, i * width + b)] +=
+                        training.weights[i] * normal.square[(a, b)];
+                }
+            }
+        }
+        for (i, j, value) in squared(&laplacian) {
+            for a in 0..width {
+                let mut add = |p: usize, q: usize| {
+                    whole[(p * width + a, q * width + a)] += alpha * alpha * value;
+                };
+                add(i, j);
+                if i != j {
+                    add(j, i);
+                }
+            }
+        }
+        let right = Mat::from_fn(n * width, 1, |at, _| {
+            training.weights[at / width] * normal.right[(at / width, at % width)]
+        });
+        let solved = whole.llt(Side::Lower).unwrap().solve(&right);
+        let y = Mat::from_fn(n, width, |i, a| solved[(i * width + a, 0)]);
+        let aggregate = training.whole(narrow((y * training.basis.transpose()).as_ref()).as_ref());
+        let apart = apart(&aggregate, &training.laplacian(&laplacian, alpha).unwrap());
+        assert!(apart < 1e-4, "{apart}");
+    }
+
     #[test]
     fn an_even_profile_is_tikhonovs_so_nothing_is_lost_beyond_the_harmonics() {
         let (_, operator, harmonics) = planted();

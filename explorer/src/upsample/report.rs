@@ -339,3 +339,76 @@ fn unity(operator: MatRef<'_, f32>) -> f64 {
     let sum = |i: usize| (0..operator.ncols()).map(|j| f64::from(operator[(i, j)])).sum::<f64>();
     (0..operator.nrows()).map(|i| (sum(i) - 1.0).abs()).fold(0.0, f64::max)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::harmonics::harmonics;
+    use super::super::patch::Patch;
+    use super::super::scene::Scene;
+    use super::*;
+    use cloth::lab::shapes::Chance;
+    use cloth::{Environment, Material, Vec3};
+
+    fn sheet(cells: usize) -> Patch {
+        let at = |u: f32, v: f32| Vec3::new(u, -v, 0.0);
+        Patch::new([cells, cells], false, at, |_, j| j == 0).unwrap()
+    }
+
+    /// A sheet that moves by chance in both resolutions.
+    fn frames(scene: &Scene, count: usize, seed: u32) -> Frames {
+        let mut chance = Chance::new(seed.into());
+        let points = scene.coarse.count();
+        let mut coarse = Mat::from_fn(points, 3 * count, |_, _| f64::from(chance.signed()));
+        for c in 0..3 * count {
+            let mean = coarse.col(c).iter().sum::<f64>() / points as f64;
+            coarse.col_mut(c).iter_mut().for_each(|x| *x -= mean);
+        }
+        let lift = matrix(&patch::dense(&scene.coarse.lift(&scene.fine), points), points);
+        let noise = Mat::from_fn(scene.fine.count(), 3 * count, |_, _| 0.02 * chance.signed());
+        let fine = lift * narrow(coarse.as_ref()) + noise;
+        Frames { coarse, fine, points, middles: vec![0.0; 3 * count] }
+    }
+
+    #[test]
+    fn what_is_learnt_and_tuned_never_sees_another_motion() {
+        let scene = Scene {
+            name: "flag",
+            coarse: sheet(5),
+            fine: sheet(12),
+            tests: 8,
+            material: Material::default(),
+            coarse_material: Material::default(),
+            environment: Environment::default(),
+            settings: cloth::coarse::Settings::default(),
+            frame_s: 1.0 / 60.0,
+            motions: Vec::new(),
+        };
+        let harmonics = harmonics(&scene.fine.mesh, 40).unwrap();
+        let frames = |seeds: [u32; 3]| seeds.map(|seed| frames(&scene, 40, seed)).to_vec();
+        let lesson = |seeds| Lesson {
+            frames: frames(seeds),
+            scene: scene.clone(),
+            harmonics: harmonics.clone(),
+            k: 40,
+            residual_m: 0.0,
+            coarse_step_us: 0.0,
+        };
+        let learn = |seeds: [u32; 3]| {
+            let lesson: Lesson = lesson(seeds);
+            let methods = lesson.methods().unwrap();
+            let probe = self::frames(&scene, 3, 99);
+            let made: Vec<Vec<u32>> = methods
+                .all
+                .iter()
+                .map(|(_, method)| {
+                    let made = lesson.upsample(method, &probe);
+                    made.col_iter().flat_map(|c| c.iter().map(|x| x.to_bits())).collect()
+                })
+                .collect();
+            (format!("{:?}", methods.parameters), made)
+        };
+        let first = learn([1, 2, 3]);
+        assert!(first == learn([1, 4, 5]), "another motion changed what was learnt");
+        assert!(first != learn([6, 2, 3]), "the training motion must");
+    }
+}

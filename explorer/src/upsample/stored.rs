@@ -13,7 +13,7 @@ use super::modes::with_modes;
 use super::report::{Method, rows};
 
 /// Rounding may cost this share of what the operator is off by itself on the training motion.
-const SHARE: f64 = 0.1;
+const SHARE: f64 = 0.15;
 /// Bits that are tried, fewest first.
 const BITS: [u8; 4] = [8, 12, 14, 16];
 /// Calls of the operator that are timed, with its weights in cache and out of it.
