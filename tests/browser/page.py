@@ -98,6 +98,8 @@ def main():
 def drive(checks, a, folder, browser):
     up = Up(a.toile, folder)
     page = browser.new_page(viewport={"width": 1280, "height": 800})
+    # Drawn in software beside an explorer, a frame may take a second.
+    page.set_default_timeout(120_000)
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     outside = []
@@ -107,7 +109,7 @@ def drive(checks, a, folder, browser):
     def picture(name):
         if a.pictures:
             a.pictures.mkdir(parents=True, exist_ok=True)
-            page.screenshot(path=a.pictures / f"{name}.png")
+            page.screenshot(path=a.pictures / f"{name}.png", timeout=240_000)
 
     def waits():
         page.goto(up.url)

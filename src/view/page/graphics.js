@@ -340,17 +340,23 @@ class Graphics {
     }
   }
 
-  // Where a pane's camera looks: after its characters, gently.
+  // Where a pane's camera looks: after its characters, gently, and as fast as they go, so that they stay in the middle.
   middle(pane, figures) {
     const sum = [0, 0, 0];
     for (const { shift } of figures) shift.forEach((x, i) => { sum[i] += x / figures.length; });
     const now = this.middles[pane];
     if (!now || Math.hypot(now[0] - sum[0], now[2] - sum[2]) > 2) {
-      this.middles[pane] = sum;
-    } else {
+      this.middles[pane] = Object.assign(sum.slice(), { sum, speed: [0, 0, 0] });
+    } else if (this.seconds > 0) {
       // As gentle at 10 frames a second as at 100.
       const near = speed => 1 - Math.exp(-speed * this.seconds);
-      now.forEach((x, i) => { now[i] = x + (sum[i] - x) * near(i === 1 ? 2 : 8); });
+      for (const i of [0, 1, 2]) {
+        const goes = i === 1 ? 0 : (sum[i] - now.sum[i]) / this.seconds;
+        now.speed[i] += (goes - now.speed[i]) * near(6);
+        now[i] += now.speed[i] * this.seconds;
+        now[i] += (sum[i] - now[i]) * near(i === 1 ? 2 : 8);
+      }
+      now.sum = sum;
     }
     return this.middles[pane];
   }
@@ -389,7 +395,7 @@ class Graphics {
     gl.viewport(left, bottom, width, height);
     gl.scissor(left, bottom, width, height);
     // Narrow panes see as much from further away.
-    const distance = orbit.distance * (1 + 0.75 * spread) * Math.max(1, 0.5 * height / width);
+    const distance = orbit.distance * (1 + 0.75 * spread) * Math.max(1, 0.62 * height / width);
     const at = [middle[0], Math.max(0.78, middle[1] - 0.12), middle[2]];
     const eye = [at[0] + distance * Math.cos(orbit.pitch) * Math.sin(orbit.yaw),
       Math.max(0.05, at[1] + distance * Math.sin(orbit.pitch)),

@@ -16,11 +16,12 @@ function made(name, text, props = {}) {
 const PANE_CHOICES = {
   show: [["the cloth", {}], ["plain skinning", { plain: true }], ["first graph", { version: 1 }],
     ["older version", { older: true }], ["coarse + upsampling", { coarse: true }]],
-  columns: [["rank: dial", {}], ["rank 10", { columns: 10 }], ["rank 50", { columns: 50 }],
-    ["full rank", { columns: 65536 }]],
-  blend: [["blend: linear", { blend: "linear" }], ["blend: off", { blend: "off" }],
-    ["blend: smooth", { blend: "smooth" }]],
+  columns: [["by dial", {}], ["rank 10", { columns: 10 }], ["rank 50", { columns: 50 }],
+    ["full", { columns: 65536 }]],
+  blend: [["linear", { blend: "linear" }], ["off", { blend: "off" }], ["smooth", { blend: "smooth" }]],
 };
+// What a choice is called over its pane.
+const PANE_WORDS = { full: "full rank", off: "no blend", smooth: "smooth blend" };
 const PANES_AT_FIRST = [[1, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0]];
 
 class Panels {
@@ -151,12 +152,16 @@ class Panels {
   drawInspected() {
     const box = at("inspected");
     const said = this.inspected;
+    const tag = said && this.tagOf(said.dead_end);
+    // Made anew only where it says something new: whoever presses a button lets go of the same one.
+    const says = JSON.stringify([said, tag, this.version && this.version.may_tag]);
+    if (says === this.inspectedSays) return;
+    this.inspectedSays = says;
     if (!said) {
       box.replaceChildren();
       return;
     }
     const figures = made("div", undefined, { className: "figures" });
-    const tag = this.tagOf(said.dead_end);
     if (said.merge) {
       figures.append(made("b", `${said.merge.mm.toFixed(1)} mm`),
         made("span", `${said.merge.clip} ${said.merge.frame}, version ${said.version}`, { className: "soft" }));
@@ -165,6 +170,8 @@ class Panels {
         made("span", `no merge here in version ${said.version}`, { className: "soft" }));
     }
     const parts = [figures, made("p", `Worst merge from here on in this walk: ${said.worst_mm.toFixed(1)} mm`)];
+    if (said.merge) parts.push(made("p", "none", { className: "scale", title: "How far the two states are apart" }));
+    if (said.merge) parts[parts.length - 1].append(made("i"), `${said.merge.mm.toFixed(0)} mm apart`);
     if (tag) {
       const fell = tag.now_mm < tag.first_mm - 0.05;
       const text = fell
@@ -186,6 +193,9 @@ class Panels {
   }
 
   makePanes() {
+    const head = made("div", undefined, { className: "pane soft" });
+    head.append(made("span"), made("span", "shows"), made("span", "columns"), made("span", "blend"));
+    at("panes").append(head);
     this.panes = PANES_AT_FIRST.map((first, index) => {
       const row = made("div", undefined, { className: "pane" });
       row.append(made("span", String(index + 1), { className: "soft" }));
@@ -210,7 +220,7 @@ class Panels {
       if (show.value === "none") continue;
       const chosen = [[PANE_CHOICES.show, show], [PANE_CHOICES.columns, columns], [PANE_CHOICES.blend, blend]];
       const pane = Object.assign({}, ...chosen.map(([choices, select]) => choices[Number(select.value)][1]));
-      const parts = chosen.map(([choices, select]) => choices[Number(select.value)][0]);
+      const parts = chosen.map(([choices, select]) => choices[Number(select.value)][0]).map(name => PANE_WORDS[name] || name);
       if (pane.older) {
         delete pane.older;
         pane.version = Math.max(1, Math.floor(this.version.version / 2));
@@ -263,9 +273,11 @@ class Panels {
     });
     const mean = values => taken.reduce((sum, tier) => sum + values[tier], 0) / taken.length;
     const stated = Math.max(0, ...taken.map((tier, i) => tier < last ? tiers.stated_mm[i][tier] : 0));
-    at("dial-cost").textContent = `${mean(tiers.columns).toFixed(0)} of ${this.version.columns} columns in the `
-      + `mean, stated error at most ${stated.toFixed(1)} mm: ${mean(tiers.decode_ms).toFixed(3)} ms a frame, `
-      + `${mean(tiers.read_mb_s).toFixed(0)} MB/s of basis read; ${tiers.kb_s.toFixed(1)} kB/s of new cloth, which comes whole`;
+    const columns = stated
+      ? `${mean(tiers.columns).toFixed(0)} of ${this.version.columns} columns on average, stated error up to ${stated.toFixed(1)} mm`
+      : `All ${this.version.columns} columns`;
+    at("dial-cost").textContent = `${columns}: ${mean(tiers.decode_ms).toFixed(3)} ms a frame, `
+      + `${mean(tiers.read_mb_s).toFixed(0)} MB/s read. New cloth: ${tiers.kb_s.toFixed(1)} kB/s.`;
   }
 
   takeFigures(said, pageMs) {
