@@ -168,6 +168,9 @@ impl Wardrobe<'_> {
         let file_vertices =
             layer.file.as_ref().map_or(surface.positions.len(), |file| file.positions.len());
         let held = surface.attach(&layer.attach, skeleton, file_vertices)?;
+        if layer.file.is_some() && worn.is_empty() {
+            self.table.ease().apply(&mut surface, &held);
+        }
         Ok((surface, held))
     }
 }

@@ -12,6 +12,7 @@ pub mod check;
 pub mod components;
 pub mod compute;
 mod distances;
+pub mod ease;
 pub mod exits;
 pub mod garment;
 pub mod gltf_file;

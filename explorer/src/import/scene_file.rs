@@ -16,6 +16,8 @@
 //! file = "$TOILE_DATA/garments/dress_long.obj"
 //! name = "dress"                               # default: the scene's name
 //! edge_length_m = 0.03                         # or vertices = 10000; default: as the file is
+//! ease_mm = 10.0                               # room around the body; default: none
+//! flare = { below_m = 0.8, times = 1.6 }       # wider towards the hem; default: not
 //! attach = [{ loop_near = "Neck" }]            # or near + within_m, or vertices
 //!
 //! [garment.material]                           # SI; each has a default
@@ -39,6 +41,7 @@ use protocol::limits::NAME_BYTES_MAX;
 use serde::Deserialize;
 
 use super::compute::Density;
+use super::ease::{Ease, FlareTable};
 use super::garment::Attachment;
 use super::metric::{ClassTable, MetricTable};
 use crate::pipe::Foreign;
@@ -160,6 +163,10 @@ pub struct GarmentTable {
     pub edge_length_m: Option<f32>,
     /// Number of vertices after refinement, exactly; in place of `edge_length_m`.
     pub vertices: Option<usize>,
+    /// Room around the body: way outwards of all that is not held, where read from a file (mm).
+    pub ease_mm: Option<f32>,
+    /// Widening towards the hem, where read from a file.
+    pub flare: Option<FlareTable>,
     /// What is held to the body.
     #[serde(default)]
     pub attach: Vec<AttachTable>,
@@ -291,6 +298,7 @@ impl SceneFile {
             return Err(value("garment", "give edge_length_m or vertices, not both"));
         }
         garment.pieces()?;
+        garment.ease().check().map_err(|(key, problem)| value(key, &problem))?;
         Ok(garment)
     }
 
@@ -396,6 +404,11 @@ impl GarmentTable {
             damping_s: field("damping_s", m.damping_s, default.damping_s, [0.0, 1.0])?,
             offset: field("offset", m.offset, default.offset, [0.0, 0.1])?,
         })
+    }
+
+    /// How the innermost layer is let out.
+    pub fn ease(&self) -> Ease {
+        Ease { ease_mm: self.ease_mm, flare: self.flare }
     }
 
     /// The layers, the innermost first; a garment of one piece has one.
