@@ -200,6 +200,13 @@ impl Run {
             Kind::DeadEnd { target, .. } => graph.state(target).class & class::FLAGGED != 0,
             _ => false,
         };
+        let penalties = class::Penalties::new(&setup.scene.metric.classes);
+        let implausible = |state: &crate::grow::graph::State| match state.kind {
+            Kind::DeadEnd { target, .. } => {
+                penalties.of(state.class, unflagged(graph.state(target).class)) > 0.0
+            }
+            _ => false,
+        };
         let merges_into_flagged = graph.states().iter().filter(|s| into_flagged(s)).count() as u64;
         let [visited_p95_mm, visited_mean_mm] = visited_mm(work);
         Summary {
@@ -220,7 +227,7 @@ impl Run {
             policy: ledger.steering().policy(),
             classes: classes(setup, work),
             merges_across_classes: graph.states().iter().filter(|s| crossed(s)).count() as u64,
-            implausible_merges: graph.crossings() as u64 - merges_into_flagged,
+            implausible_merges: graph.states().iter().filter(|s| implausible(s)).count() as u64,
             merges_into_flagged,
             cpu_s: process_cpu_s().unwrap_or(wall_s),
             frames_per_wall_s: frames as f64 / wall_s.max(1e-9),
