@@ -77,6 +77,7 @@ pub use character::{Character, Group, Passed, StepOutcome, decode};
 #[cfg(feature = "driver")]
 pub use client::{Client, ClientConfig, ClientError, Status};
 pub use cloth::Rigid;
+pub use codec::toile::TIERS;
 pub use free::{Outside, Push};
 pub use loader::{FirstCloth, Memory};
 pub use protocol::message::TagOutcome;

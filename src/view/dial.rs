@@ -6,13 +6,11 @@
 use std::time::Instant;
 
 use anyhow::Result;
-use client_lib::{Character, Histogram, PoseId};
+use client_lib::{Character, Histogram, PoseId, TIERS};
 use serde::Serialize;
 
 /// States that stand for all, spread over the poses.
 const SAMPLES: usize = 64;
-/// Columns of the tiers; behind them come all columns.
-const TIERS: [usize; 4] = [16, 32, 64, 128];
 
 /// What the tiers of a version state, and what they cost here.
 #[derive(Debug, Clone, Default, Serialize)]

@@ -190,7 +190,7 @@ pub fn load_with(
 /// The data folder: the environment's `TOILE_DATA`, else the first `shared/data` beside the
 /// current folder or one above it that holds a character.
 pub fn data_dir() -> Option<PathBuf> {
-    if let Some(folder) = std::env::var_os("TOILE_DATA") {
+    if let Some(folder) = std::env::var_os("TOILE_DATA").filter(|folder| !folder.is_empty()) {
         return Some(PathBuf::from(folder));
     }
     let here = std::env::current_dir().ok()?;

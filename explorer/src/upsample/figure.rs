@@ -1,6 +1,6 @@
 //! The real character as coarse cloth sees it: capsules on bones (Kavan et al. 2011, section 6).
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use cloth::coarse::Capsule;
@@ -8,6 +8,7 @@ use cloth::{Body, Pose, Rigid, Vec3};
 
 use super::scene::smooth;
 use crate::import::character::{Character, CharacterError, Clip, read_character};
+use crate::import::data_dir;
 use crate::import::transition::{self, Transition};
 
 /// Poses a second of the clips.
@@ -75,7 +76,7 @@ pub enum FigureError {
     #[error("this scene needs the real character: set TOILE_DATA to the folder of character.glb")]
     NoData,
     /// The file cannot be read.
-    #[error("{path}: {source}")]
+    #[error("{path}: {source}; TOILE_DATA names the folder of character.glb")]
     File {
         /// Which.
         path: PathBuf,
@@ -91,17 +92,12 @@ pub enum FigureError {
 }
 
 impl Figure {
-    /// Reads `character.glb` from the folder that `TOILE_DATA` names.
+    /// Reads `character.glb` from the data folder ([`data_dir`]).
     ///
     /// # Errors
     /// No folder, no file, another character than the scenes were made for.
     pub fn load() -> Result<Self, FigureError> {
-        let folder = std::env::var_os("TOILE_DATA").map(PathBuf::from);
-        let found = folder.or_else(|| {
-            let here = Path::new(env!("CARGO_MANIFEST_DIR"));
-            here.ancestors().map(|a| a.join("shared/data")).find(|d| d.is_dir())
-        });
-        let path = found.ok_or(FigureError::NoData)?.join("character.glb");
+        let path = data_dir().ok_or(FigureError::NoData)?.join("character.glb");
         let bytes = std::fs::read(&path).map_err(|source| FigureError::File { path, source })?;
         Self::new(read_character(&bytes, None, RATE)?)
     }
