@@ -4,6 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result, ensure};
 use explorer::certificate::{Bifurcation, Certificate, Replay, certify, replay};
+use explorer::faults::{Flagged, flagged};
 use explorer::pack::inspect::{GarmentInspection, inspect};
 use explorer::pipe::simulators;
 use explorer::telemetry::walked_since;
@@ -35,6 +36,8 @@ struct Summary<'a> {
     raw_bytes: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     bifurcations: Option<Vec<Bifurcation>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    flagged: Option<Flagged>,
     #[serde(flatten)]
     replay: Option<Replay>,
 }
@@ -67,6 +70,10 @@ pub fn run(a: &args::Inspect) -> Result<()> {
             }
             let proof = a.replay.map(|count| replayed(&explored, &certificate, count, a));
             summary.replay = proof.transpose()?;
+            // A foreign program's frames have the bounds that it gives them.
+            if explored.scene.simulator.is_none() {
+                summary.flagged = Some(flagged(archive, &explored.scene)?);
+            }
             summary.bifurcations = Some(certificate.bifurcations);
         }
         if a.json {
@@ -101,6 +108,7 @@ fn summary(version: u64, garment: &GarmentInspection) -> Summary<'_> {
         link_bytes: garment.link_bytes,
         raw_bytes: garment.raw_bytes,
         bifurcations: None,
+        flagged: None,
         replay: None,
     }
 }
@@ -189,6 +197,12 @@ fn print(s: &Summary<'_>) {
             b.walks.len(),
             b.merges.len(),
             if b.implausible { ", implausible" } else { "" }
+        );
+    }
+    if let Some(f) = &s.flagged {
+        println!(
+            "flagged   {} frames: {} by strain, {} by speed, {} deep in the body, {} by crossings",
+            f.frames, f.strain, f.speed, f.deep, f.crossings
         );
     }
     if let Some(r) = &s.replay {

@@ -171,6 +171,36 @@ impl ClothSimulator {
         self.crossings.find(&positions).len() as u64
     }
 
+    /// Why a frame that was simulated along an edge is out of bounds, from the states at its ends alone.
+    pub fn fault(
+        &mut self,
+        (before, after): (&GridState, &GridState),
+        edge: EdgeId,
+    ) -> Option<Fault> {
+        let scene = self.scene.clone();
+        let edge = scene.primary.edge(edge);
+        let from = &scene.primary.pose(edge.from).pose;
+        let to = scene.primary.pose(edge.to).pose.moved(&edge.alignment());
+        let home =
+            Rigid { translation: Vec3::new(-from.root.x, 0.0, -from.root.z), ..Rigid::IDENTITY };
+        let (from, to) = (from.moved(&home), to.moved(&home));
+        let body_speed_m_s = self.body_speed(&from, &to, 1.0 / scene.primary.fps());
+        let mut quality = self.measured_cloth(&to_world(after, &to.hips()));
+        if let Some(surface) = self.model.surface() {
+            let (mut joints, mut body) = (Vec::new(), Vec::new());
+            scene.body.skin(&to, &mut joints, &mut body);
+            let offset = self.model.material().offset;
+            let positions = to_world(after, &to.hips()).positions;
+            let posed = surface.posed(&body);
+            watchdog::measure_depth(surface, &posed, &positions, offset, &mut quality);
+        }
+        let crossings = quality.crossings;
+        let is_new = scene.exploration.self_contact
+            && crossings > 0
+            && crossings > self.crossings_of(before);
+        Fault::of(&quality, body_speed_m_s).or(is_new.then_some(Fault::Crossings(crossings)))
+    }
+
     /// Speed of the fastest vertex of the body between two poses (m/s), measured on the straight
     /// way from one to the other.
     fn body_speed(&self, from: &Pose, to: &Pose, seconds: f32) -> f32 {
@@ -184,22 +214,27 @@ impl ClothSimulator {
     /// Measures a state as it will be kept: rounded.
     fn measured(&mut self, state: GridState, pose: &Pose) -> Frame {
         let world = to_world(&state, &pose.hips());
-        let crossings = self.crossings.find(&world.positions).len() as u64;
-        let mut quality = FrameQuality {
-            frames: 1,
-            crossings,
-            crossed_frames: u64::from(crossings > 0),
-            vertex_frames: state.vertex_count() as u64,
-            stretch_max: measure::stretch_max(self.model.mesh(), &world.positions),
-            speed_max_m_s: world.velocities.iter().map(|v| v.length()).fold(0.0, f32::max),
-            ..FrameQuality::default()
-        };
+        let mut quality = self.measured_cloth(&world);
         if let Some(surface) = self.model.surface() {
             let offset = self.model.material().offset;
             let body = self.workspace.body();
             watchdog::measure_depth(surface, body, &world.positions, offset, &mut quality);
         }
         Frame { state, quality }
+    }
+
+    /// What is measured on a frame's end without the body.
+    fn measured_cloth(&mut self, world: &State) -> FrameQuality {
+        let crossings = self.crossings.find(&world.positions).len() as u64;
+        FrameQuality {
+            frames: 1,
+            crossings,
+            crossed_frames: u64::from(crossings > 0),
+            vertex_frames: world.positions.len() as u64,
+            stretch_max: measure::stretch_max(self.model.mesh(), &world.positions),
+            speed_max_m_s: world.velocities.iter().map(|v| v.length()).fold(0.0, f32::max),
+            ..FrameQuality::default()
+        }
     }
 
     fn check_rest(&self) -> Result<(), SimulateError> {

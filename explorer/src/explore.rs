@@ -13,6 +13,7 @@ use crate::cpu::CpuClock;
 use crate::disk::free_bytes;
 use crate::grow::graph::Graph;
 use crate::grow::job::{JOB_STATES_MAX, JobError};
+use crate::grow::journal;
 use crate::grow::ledger::Phase;
 use crate::grow::policy::Policy;
 use crate::grow::record::{PublishRecord, SteerRecord, TagRecord};
@@ -41,8 +42,8 @@ pub const WORKERS_MAX: usize = 1024;
 pub struct ExploreOptions {
     /// Threads that simulate, at least 1. The outcome does not depend on it.
     pub workers: usize,
-    /// Ends once the store's graph has this many simulated frames, the drape apart (checked at
-    /// the end of a round, so that a few more may be simulated).
+    /// Ends after the job with which the store's graph has this many simulated frames, the drape
+    /// apart, once the initial pass is over.
     pub frames: Option<u64>,
     /// Ends once the best prefix's worst merge error is at most this (m).
     pub error_m: Option<f32>,
@@ -65,6 +66,8 @@ pub struct ExploreOptions {
     /// Whether an exploration that ends by `frames` or `error_m` leaves the best prefix as head
     /// (design decision 6). One that is stopped never does.
     pub best_prefix_at_end: bool,
+    /// The journal is compacted when it has more than so many bytes that are not (about 9 a state).
+    pub journal_tail_bytes: u64,
     /// How often to look for tags while jobs run (each look costs a request to the store).
     pub tags_every: Duration,
     /// Asked often, also in the middle of a round: true drops the jobs in flight and returns.
@@ -86,6 +89,7 @@ impl Default for ExploreOptions {
             upsampler: None,
             paper: false,
             best_prefix_at_end: true,
+            journal_tail_bytes: journal::TAIL_BYTES,
             tags_every: Duration::from_millis(500),
             should_stop: Arc::new(|| false),
         }
@@ -169,7 +173,8 @@ pub async fn explore(
     options: &ExploreOptions,
     progress: &mut dyn FnMut(&Progress),
 ) -> Result<Summary, ExploreError> {
-    let work = Work::open(&place.work, scene, options.paper)?;
+    let tail_bytes = options.journal_tail_bytes;
+    let work = Work::open_with(&place.work, scene, options.paper, tail_bytes)?;
     let (store, key) = (Arc::clone(&place.store), place.key.clone());
     let stored = codec_of(&*store, &scene.garment.name).await.map_err(PublishError::from)?;
     let settings = match options.codec.or(stored).unwrap_or_default() {
@@ -323,6 +328,13 @@ async fn run(
     let mut paused = Paused::default();
     progress(&run.progress(&setup, &work, None));
     loop {
+        if !work.ledger().round().is_done() && frames_reached(&work, options) {
+            if behind {
+                let newest = work.graph().commit();
+                publish(&mut work, publisher, (newest, false)).await?;
+            }
+            return finish(&setup, work, &run, publisher, End::Frames).await;
+        }
         if work.ledger().round().is_done() {
             let ended = between_rounds(
                 &setup,
@@ -350,9 +362,11 @@ async fn run(
         };
         let tags = looks(&*publisher, work.ledger().newest_tag(), options.tags_every);
         let asks = (&stop as &dyn Fn() -> bool, tags);
-        let ended = round::run(&mut work, &mut simulators, &mut paused, asks, &mut each).await?;
-        match ended {
-            Ended::Done => {}
+        let ended =
+            round::run(&mut work, &mut simulators, &mut paused, asks, options.frames, &mut each);
+        match ended.await? {
+            // The next look ends it.
+            Ended::Done | Ended::Frames => {}
             Ended::Stopped => return Ok(run.summary(&setup, &work, End::Stopped)),
             Ended::Interrupted(tags) => {
                 tracing::info!(newest = tags.newest, "the round waits: something was tagged");
@@ -478,6 +492,13 @@ fn due(work: &Work, every: u64) -> bool {
         Some(last) if work.ledger().is_round_of_tags() => last.commit != work.graph().commit(),
         Some(last) => work.graph().simulated_frames() / every > frames_at(last.commit) / every,
     }
+}
+
+/// Whether a whole graph has as many frames as were asked for.
+fn frames_reached(work: &Work, options: &ExploreOptions) -> bool {
+    let graph = work.graph();
+    work.ledger().phase() == Phase::Expansion
+        && options.frames.is_some_and(|frames| graph.simulated_frames() >= frames)
 }
 
 fn reached(graph: &Graph, options: &ExploreOptions) -> Option<End> {

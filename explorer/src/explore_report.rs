@@ -128,6 +128,8 @@ pub struct Summary {
     pub visited_p95_mm: f64,
     /// Mean of the same (mm).
     pub visited_mean_mm: f64,
+    /// How many merges a player passes in a second of play: times the mean, what is seen of them.
+    pub visited_merges_per_s: f64,
     /// Measures of all frames, the drape's included.
     pub quality: FrameQuality,
     /// Why it ended.
@@ -207,8 +209,8 @@ impl Run {
             }
             _ => false,
         };
-        let merges_into_flagged = graph.states().iter().filter(|s| into_flagged(s)).count() as u64;
-        let [visited_p95_mm, visited_mean_mm] = visited_mm(work);
+        let merges_into_flagged = graph.states().filter(|s| into_flagged(s)).count() as u64;
+        let [visited_p95_mm, visited_mean_mm, visited_merges_per_s] = visited(work);
         Summary {
             poses: graph.primary().poses().len() as u64,
             edges: graph.primary().edges().len() as u64,
@@ -226,13 +228,14 @@ impl Run {
             frames_flagged: ledger.quality().frames_flagged,
             policy: ledger.steering().policy(),
             classes: classes(setup, work),
-            merges_across_classes: graph.states().iter().filter(|s| crossed(s)).count() as u64,
-            implausible_merges: graph.states().iter().filter(|s| implausible(s)).count() as u64,
+            merges_across_classes: graph.states().filter(|s| crossed(s)).count() as u64,
+            implausible_merges: graph.states().filter(|s| implausible(s)).count() as u64,
             merges_into_flagged,
             cpu_s: process_cpu_s().unwrap_or(wall_s),
             frames_per_wall_s: frames as f64 / wall_s.max(1e-9),
             visited_p95_mm,
             visited_mean_mm,
+            visited_merges_per_s,
             quality: *ledger.quality(),
             end,
         }
@@ -249,11 +252,11 @@ fn classes(setup: &Setup<'_>, work: &Work) -> Vec<ClassCount> {
     counts.into_iter().map(named).collect()
 }
 
-/// 95th percentile and mean of merge errors weighted by visits (mm).
-fn visited_mm(work: &Work) -> [f64; 2] {
+/// 95th percentile and mean of merge errors weighted by visits (mm), and how many are passed in a second.
+fn visited(work: &Work) -> [f64; 3] {
     let graph = work.graph();
     if graph.initialised().is_none() {
-        return [0.0; 2];
+        return [0.0; 3];
     }
     let visits = visits(graph, work.ledger().steering().model(), &[]);
     // Largest first.
@@ -269,5 +272,6 @@ fn visited_mm(work: &Work) -> [f64; 2] {
         above += visits;
         above >= 0.05 * all
     });
-    [at.map_or(0.0, |(error_m, _)| 1e3 * error_m), 1e3 * mean / all.max(1e-300)]
+    let merges_per_s = all * f64::from(graph.primary().fps());
+    [at.map_or(0.0, |(error_m, _)| 1e3 * error_m), 1e3 * mean / all.max(1e-300), merges_per_s]
 }

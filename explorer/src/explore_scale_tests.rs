@@ -8,9 +8,11 @@ use rand_core::{Rng, SeedableRng};
 
 use super::*;
 use crate::certificate::{certify, replay};
+use crate::grid::GridState;
 use crate::grow::archive::Archive;
 use crate::grow::policy::{WalkModel, visits};
 use crate::scene::ClassRule;
+use crate::simulator::{Frame, FrameQuality, SimulateError};
 
 const FRAMES: u64 = 1500;
 
@@ -31,11 +33,16 @@ fn slow_scene() -> Scene {
     scene
 }
 
+/// A disk that may be filled, and a journal that is compacted many times over.
+fn scarce() -> ExploreOptions {
+    ExploreOptions { keep_free_bytes: 0, journal_tail_bytes: 1500, ..options(FRAMES) }
+}
+
 /// Not a test of its own: the process that the tests below start, kill and starve.
 #[test]
 fn child() {
     let Some(folder) = std::env::var_os("TOILE_TEST_CHILD") else { return };
-    let options = ExploreOptions { workers: 2, keep_free_bytes: 0, ..options(FRAMES) };
+    let options = ExploreOptions { workers: 2, ..scarce() };
     let mut said = |progress: &Progress| println!("reported {}", progress.states);
     let place = child_place(Path::new(&folder));
     let (scene, toy) = (slow_scene(), Toy::new(150));
@@ -77,7 +84,7 @@ fn read_reports(child: &mut std::process::Child) -> (u64, String) {
 }
 
 fn whole_run(folder: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
-    let options = ExploreOptions { keep_free_bytes: 0, ..options(FRAMES) };
+    let options = scarce();
     let place = child_place(folder);
     let (scene, toy, mut quiet) = (slow_scene(), Toy::new(150), |_: &Progress| {});
     block_on(super::super::explore(&scene, &toy, &place, &options, &mut quiet)).unwrap();
@@ -309,63 +316,130 @@ fn it_stops_by_itself_at_the_error_asked_for() {
     assert!(summary.best_worst_error_mm <= 50.0, "{}", summary.best_worst_error_mm);
 }
 
-/// `cargo test --release -p explorer -- --ignored --nocapture very_large`; `TOILE_STATES` states
-/// (100,000 unless given) of a simulator that costs nothing.
+/// `cargo test --release -p explorer --lib -- --ignored --nocapture very_large`; `TOILE_STATES` states
+/// (100,000 unless given) of a simulator that costs nothing, with as many landmarks as a garment has.
 #[test]
-#[ignore = "takes a minute; prints times"]
+#[ignore = "takes minutes; prints times"]
 fn very_large_folders_are_resumed_quickly() {
     let wanted = std::env::var("TOILE_STATES").map_or(100_000, |n| n.parse().unwrap());
     let mut scene = toy_scene();
-    scene.exploration.depth_frames = 400;
+    scene.exploration.depth_frames = 100;
+    scene.exploration.round_jobs = 8;
     scene.exploration.publish_every_frames = u64::MAX;
+    scene.garment.positions = (0..24).map(|v| Vec3::new(v as f32, 0.0, 0.0)).collect();
+    // As many poses as a dozen clips have, and twelve ways between clips.
+    let (clips, length) = (12, 250);
+    let ring = (0..clips * length).map(|p| (p, (p + 1) % (clips * length)));
+    let ways = (0..clips).map(|c| (c * length + 200, (c * 7 + 5) % clips * length + 10));
+    let mut edges: Vec<(u32, u32)> = ring.chain(ways).collect();
+    edges.sort_unstable();
+    scene.primary = std::sync::Arc::new(toy::primary(clips * length, &edges));
     let folder = tempfile::tempdir().unwrap();
-    let options = ExploreOptions { paper: true, best_prefix_at_end: false, ..options(wanted) };
-    let clock = Instant::now();
-    let mut store = Memory::default();
-    let setup = Setup {
-        scene: &scene,
-        simulators: &Toy::new(200),
-        work: folder.path(),
-        folder: None,
-        options: &options,
-    };
-    let work = Work::open(folder.path(), &scene, true).unwrap();
-    let explored = block_on(run(setup, work, &mut store, &mut |_| {})).unwrap();
-    println!("{} states explored in {:.1} s", explored.states, clock.elapsed().as_secs_f64());
-    let size = |name| std::fs::metadata(folder.path().join(name)).unwrap().len();
-    println!(
-        "bytes a state: journal {:.1}, landmarks {:.1}",
-        size("journal") as f64 / explored.states as f64,
-        size("landmarks") as f64 / explored.states as f64
-    );
-    let before = resident_bytes();
-    let clock = Instant::now();
-    let work = Work::open(folder.path(), &scene, true).unwrap();
-    println!(
-        "resumed in {:.2} s; {:.0} bytes of memory a state",
-        clock.elapsed().as_secs_f64(),
-        resident_bytes().saturating_sub(before) as f64 / explored.states as f64
-    );
-    assert_eq!(work.graph().next_id().0, explored.states);
-    let clock = Instant::now();
-    let (_, states) = (0..200).fold((0u64, 0u64), |(sum, states), id| {
-        let id = StateId(id * explored.states / 200);
+    let long = ExploreOptions { paper: true, best_prefix_at_end: false, ..options(wanted) };
+    let mut done = 0;
+    // Twice as long each time: what grows is seen.
+    for frames in [wanted / 8, wanted / 4, wanted / 2, wanted] {
+        let options = ExploreOptions { frames: Some(frames), ..long.clone() };
+        let clock = Instant::now();
+        let work = Work::open(folder.path(), &scene, true).unwrap();
+        let resumed_s = clock.elapsed().as_secs_f64();
+        let rounds = work.ledger().round().number;
+        let before = (work.journal().bytes(), work.journal().tail_bytes());
+        let setup = Setup {
+            scene: &scene,
+            simulators: &Wide(24),
+            work: folder.path(),
+            folder: None,
+            options: &options,
+        };
+        let mut store = Unread::default();
+        let clock = Instant::now();
+        let explored = block_on(run(setup, work, &mut store, &mut |_| {})).unwrap();
+        let wall_s = clock.elapsed().as_secs_f64();
+        let work = Work::open(folder.path(), &scene, true).unwrap();
+        let made = work.ledger().round().number - rounds;
+        println!(
+            "from {done} states, resumed in {resumed_s:.2} s (journal {} bytes, {} of them not packed), \
+             to {}: {:.1} ms a round, {:.3} ms a frame",
+            before.0,
+            before.1,
+            explored.states,
+            1e3 * wall_s / made.max(1) as f64,
+            1e3 * wall_s / (explored.states - done) as f64,
+        );
+        done = explored.states;
+        measure_search(&work, done);
+    }
+}
+
+fn measure_search(work: &Work, states: u64) {
+    let (clock, searches) = (Instant::now(), 200);
+    let mut among = 0;
+    for id in (0..searches).map(|at| StateId(at * states / searches)) {
         let state = work.states().read(id).unwrap();
-        let pose = work.graph().state(id).pose;
-        let known = work.graph().interior(pose);
+        let known = work.graph().interior(work.graph().state(id).pose);
         let found = work.similar().nearest(work.states(), (&state, 0), known, f32::INFINITY);
-        (sum + found.unwrap().unwrap().target.0, states + known.len() as u64)
-    });
+        assert!(found.unwrap().is_some());
+        among += known.len() as u64;
+    }
+    let [now, peak] = ["VmRSS:", "VmHWM:"].map(memory_mb);
     println!(
-        "a search among {} states takes {:.3} ms",
-        states / 200,
-        clock.elapsed().as_secs_f64() * 1e3 / 200.0
+        "  {} bytes of journal; a search at a place taken at random, among {}: {:.2} ms; memory {now:.0} MB \
+         (peak {peak:.0}), {:.1} of it landmarks",
+        work.journal().bytes(),
+        among / searches,
+        clock.elapsed().as_secs_f64() * 1e3 / searches as f64,
+        work.similar().landmark_bytes() as f64 / 1e6,
     );
 }
 
-/// Memory of this process, where the system tells it.
-fn resident_bytes() -> u64 {
-    let text = std::fs::read_to_string("/proc/self/statm").unwrap_or_default();
-    let pages: u64 = text.split_whitespace().nth(1).and_then(|p| p.parse().ok()).unwrap_or(0);
-    pages * 4096
+/// A store that takes everything and keeps nothing.
+#[derive(Default)]
+struct Unread(u64);
+
+impl Publish for Unread {
+    fn head(&self) -> (Option<VersionNumber>, u64) {
+        ((self.0 > 0).then_some(VersionNumber(self.0)), 0)
+    }
+
+    async fn publish(&mut self, _: &dyn GraphView, _: bool) -> Result<VersionNumber, PublishError> {
+        self.0 += 1;
+        Ok(VersionNumber(self.0))
+    }
+
+    async fn walked(&self, after: u64) -> Result<Walked, object_store::Error> {
+        Ok(Walked { newest: after, ..Walked::default() })
+    }
+
+    async fn tagged(&self, after: u64) -> Result<Tagged, object_store::Error> {
+        Ok(Tagged { newest: after, ..Tagged::default() })
+    }
+}
+
+/// The toy, of so many vertices.
+struct Wide(usize);
+
+impl Simulator for Wide {
+    fn step(&mut self, state: &GridState, edge: EdgeId) -> Result<Frame, SimulateError> {
+        Toy::new(200).step(state, edge)
+    }
+
+    fn drape(&mut self) -> Result<Frame, SimulateError> {
+        let state = GridState { positions: vec![[0; 3]; self.0], velocities: vec![[0; 3]; self.0] };
+        Ok(Frame { state, quality: FrameQuality::default() })
+    }
+}
+
+impl SimulatorFactory for Wide {
+    fn simulator(&self) -> Box<dyn Simulator> {
+        Box::new(Wide(self.0))
+    }
+}
+
+/// Memory of this process by a line of its status (MB), where the system tells it.
+fn memory_mb(line: &str) -> f64 {
+    let text = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let found = text.lines().find_map(|l| l.strip_prefix(line));
+    let kilobytes = found.and_then(|rest| rest.split_whitespace().next()?.parse::<f64>().ok());
+    kilobytes.unwrap_or(0.0) / 1e3
 }

@@ -284,11 +284,11 @@ fn tolerance_and_depth_are_respected() {
             depths[id] = if same_job { depths[parent.index()] + 1 } else { 1 };
             deepest = deepest.max(depths[id]);
             // What it was when its job was committed.
-            if let Some(merge) = state.merges.first() {
+            let merges = graph.merges(StateId(id as u64));
+            if let Some(merge) = merges.first() {
                 early += u32::from(depths[id] < 6);
                 assert!(depths[id] == 6 || merge.error_m <= 0.004, "{id}: {merge:?}");
             }
-            let merges = &state.merges;
             assert!(merges.windows(2).all(|m| m[1].error_m < m[0].error_m));
             assert!(!paper || merges.len() <= 1, "no re-merging with --paper");
         }
@@ -303,13 +303,14 @@ fn without_paper_dead_ends_move_to_nearer_states() {
     let (scene, toy) = (toy_scene(), Toy::new(200));
     explore(&scene, &toy, (folder.path(), &mut Memory::default()), &options(500)).unwrap();
     let work = Work::open(folder.path(), &scene, false).unwrap();
-    assert!(work.graph().states().iter().any(|state| state.merges.len() > 1));
+    let ids = || (0..work.graph().next_id().0).map(StateId);
+    assert!(ids().any(|state| work.graph().merges(state).len() > 1));
     // Each dead end is merged into the nearest interior state of its pose, whatever its age.
     let metric = work.similar().metric();
     for (id, state) in (0..).zip(work.graph().states()) {
         if let Kind::DeadEnd { error_m, .. } = state.kind {
             let frame = work.states().read(StateId(id)).unwrap();
-            for other in work.graph().interior(state.pose) {
+            for other in work.graph().interior(state.pose).iter() {
                 let other = work.states().read(*other).unwrap();
                 assert!(metric.distance(&frame, &other) >= error_m);
             }
@@ -460,7 +461,11 @@ fn what_people_point_at_is_simulated_next_and_shown_at_once() {
     // One that was never a dead end, and one that is none of this graph, cost nothing.
     store.tags = vec![StateId(0), least, StateId(1 << 40), least];
     let mut versions = Vec::new();
-    let options = ExploreOptions { best_prefix_at_end: false, ..options(frames + 1) };
+    let options = ExploreOptions {
+        best_prefix_at_end: false,
+        tags_every: Duration::ZERO,
+        ..options(frames + 1)
+    };
     explore(&scene, &toy, (folder.path(), &mut store), &options).unwrap();
     versions.extend_from_slice(&store.versions[before..]);
     let is_simulated =

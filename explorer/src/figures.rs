@@ -161,7 +161,8 @@ pub fn graph_drawing(view: &View<'_>, scene: &Scene, by: ColourBy) -> Drawing {
 
 /// Every state's place: around the root by how many leaves lie before it, outwards by its frames.
 fn layout(graph: &Graph, count: usize) -> Vec<[f32; 2]> {
-    let parent = |id: usize| graph.states()[id].parent.map_or(0, |(parent, _)| parent.index());
+    let parent =
+        |id: usize| graph.state(StateId(id as u64)).parent.map_or(0, |(parent, _)| parent.index());
     let mut depth = vec![0u32; count];
     let mut leaves = vec![0u32; count];
     for id in 1..count {

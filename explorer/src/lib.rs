@@ -15,6 +15,7 @@ pub mod cpu;
 pub mod decode_bench;
 pub mod disk;
 pub mod explore;
+pub mod faults;
 pub mod figures;
 pub mod grid;
 pub mod grow;

@@ -44,10 +44,18 @@ pub fn write_at(file: &File, mut bytes: &[u8], mut offset: u64) -> io::Result<()
 
 /// Makes a file with these first bytes: after a crash it is there whole, or not at all.
 pub fn create_whole(path: &Path, bytes: &[u8]) -> io::Result<File> {
+    create_with(path, |file| file.write_all(bytes))
+}
+
+/// Makes a file with what `write` writes: after a crash it is there whole, or what was there before is.
+pub fn create_with(
+    path: &Path,
+    write: impl FnOnce(&mut File) -> io::Result<()>,
+) -> io::Result<File> {
     let temporary = path.with_extension("new");
     let mut file =
         File::options().read(true).write(true).create(true).truncate(true).open(&temporary)?;
-    file.write_all(bytes)?;
+    write(&mut file)?;
     file.sync_all()?;
     std::fs::rename(&temporary, path)?;
     if cfg!(unix)

@@ -15,23 +15,18 @@ use std::sync::Arc;
 use protocol::{EdgeId, PoseId, StateId};
 
 use super::class::{Class, Penalties};
+use super::nodes::{Next, Nodes, STATES_MAX};
 use super::queue::Queue;
 use crate::primary::PrimaryGraph;
 use crate::view::Run;
 
 /// What a state is.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Kind {
     /// Its out-edges are being simulated; only inside a commit or the initial pass.
-    Open {
-        /// What was simulated so far, per out-edge of its pose.
-        next: Vec<Option<StateId>>,
-    },
+    Open,
     /// All its out-edges were simulated.
-    Interior {
-        /// The state simulated on each out-edge of its pose.
-        next: Vec<StateId>,
-    },
+    Interior,
     /// Simulated, merged into another.
     DeadEnd {
         /// An interior state of the same pose.
@@ -52,8 +47,9 @@ pub struct Merge {
     pub error_m: f32,
 }
 
-/// A node of the secondary graph.
-#[derive(Debug, Clone, PartialEq)]
+/// A node of the secondary graph; what was simulated on from it is told by [`Graph::next`], the merges it went
+/// through by [`Graph::merges`].
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct State {
     /// Its pose.
     pub pose: PoseId,
@@ -65,8 +61,6 @@ pub struct State {
     pub kind: Kind,
     /// The commit since which it is interior.
     pub interior_since: Option<u64>,
-    /// Every merge it went through, oldest first.
-    pub merges: Vec<Merge>,
 }
 
 /// The graph after one commit; commits are numbered from 0 (the drape).
@@ -104,6 +98,9 @@ pub enum GraphError {
     /// A state was left open at the end of a commit.
     #[error("state {0} was left without a successor on some edge")]
     NotTotal(StateId),
+    /// There are as many states as there can be.
+    #[error("a graph holds at most {STATES_MAX} states; begin another one")]
+    Full,
     /// Two tables disagree.
     #[error("state {0}: {1}")]
     Broken(StateId, &'static str),
@@ -113,9 +110,10 @@ pub enum GraphError {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Graph {
     primary: Arc<PrimaryGraph>,
-    states: Vec<State>,
+    nodes: Nodes,
     runs: Vec<Run>,
-    interior: Vec<Vec<StateId>>,
+    /// Shared with the jobs of a round, who look at them while states are added.
+    interior: Vec<Arc<Vec<StateId>>>,
     dead_ends: Vec<BTreeSet<StateId>>,
     queue: Queue,
     /// Merges that carry a penalty, by cost.
@@ -137,9 +135,9 @@ impl Graph {
         let poses = primary.poses().len();
         let mut graph = Self {
             primary,
-            states: Vec::new(),
+            nodes: Nodes::default(),
             runs: Vec::new(),
-            interior: vec![Vec::new(); poses],
+            interior: vec![Arc::default(); poses],
             dead_ends: vec![BTreeSet::new(); poses],
             queue: Queue::default(),
             crossing: Queue::default(),
@@ -159,18 +157,28 @@ impl Graph {
     }
 
     /// All states, by id.
-    pub fn states(&self) -> &[State] {
-        &self.states
+    pub fn states(&self) -> impl ExactSizeIterator<Item = State> {
+        (0..self.nodes.count()).map(|id| self.nodes.get(StateId(id as u64)))
     }
 
     /// A state by id.
-    pub fn state(&self, state: StateId) -> &State {
-        &self.states[state.index()]
+    pub fn state(&self, state: StateId) -> State {
+        self.nodes.get(state)
+    }
+
+    /// What was simulated on each out-edge of a state's pose.
+    pub fn next(&self, state: StateId) -> Next<'_> {
+        self.nodes.next(&self.primary, state)
+    }
+
+    /// Every merge that a state went through, oldest first.
+    pub fn merges(&self, state: StateId) -> &[Merge] {
+        self.nodes.merges(state)
     }
 
     /// Id of the next state to be created.
     pub fn next_id(&self) -> StateId {
-        StateId(self.states.len() as u64)
+        StateId(self.nodes.count() as u64)
     }
 
     /// Runs of consecutive states, in order of creation.
@@ -179,7 +187,7 @@ impl Graph {
     }
 
     /// Interior states of a pose, in the order in which they became interior.
-    pub fn interior(&self, pose: PoseId) -> &[StateId] {
+    pub fn interior(&self, pose: PoseId) -> &Arc<Vec<StateId>> {
         &self.interior[pose.index()]
     }
 
@@ -215,7 +223,7 @@ impl Graph {
 
     /// Frames simulated so far, drape apart: every one of them is a state.
     pub fn simulated_frames(&self) -> u64 {
-        self.states.len() as u64 - 1
+        self.nodes.count() as u64 - 1
     }
 
     /// Largest merge error (m).
@@ -263,8 +271,10 @@ impl Graph {
     /// The paper's transition table C(c, edge): the interior state that follows `state` on the
     /// `edge`, merges applied. `None` where `state` is not interior or `edge` leaves another pose.
     pub fn follow(&self, state: StateId, edge: EdgeId) -> Option<StateId> {
-        let Kind::Interior { next } = &self.states.get(state.index())?.kind else { return None };
-        let next = *next.get(self.slot(state, edge)?)?;
+        if self.known(state).ok()?.kind != Kind::Interior {
+            return None;
+        }
+        let next = self.next(state).get(self.slot(state, edge)?)?;
         match self.state(next).kind {
             Kind::DeadEnd { target, .. } => Some(target),
             _ => Some(next),
@@ -299,21 +309,23 @@ impl Graph {
         edge: EdgeId,
         class: Class,
     ) -> Result<StateId, GraphError> {
-        let slot = match &self.known(parent)?.kind {
-            Kind::Open { next } => self.slot(parent, edge).filter(|slot| next[*slot].is_none()),
+        let slot = match self.known(parent)?.kind {
+            Kind::Open => self.slot(parent, edge),
             other => return Err(GraphError::WrongKind(parent, other.name(), "an open state")),
         };
+        let slot = slot.filter(|slot| self.next(parent).get(*slot).is_none());
         let slot = slot.ok_or(GraphError::WrongEdge(parent, edge))?;
-        let child = self.push(self.primary.edge(edge).to, Some((parent, edge)), class);
-        if let Kind::Open { next } = &mut self.states[parent.index()].kind {
-            next[slot] = Some(child);
+        if self.next_id().0 >= STATES_MAX {
+            return Err(GraphError::Full);
         }
+        let child = self.push(self.primary.edge(edge).to, Some((parent, edge)), class);
+        self.nodes.set_next(&self.primary, (parent, slot), child);
         Ok(child)
     }
 
     /// Says the class of the drape, which is known once it was simulated.
     pub fn classify_drape(&mut self, class: Class) {
-        self.states[0].class = class;
+        self.nodes.set_class(StateId(0), class);
     }
 
     /// Makes an open state interior: all its edges were simulated.
@@ -321,16 +333,15 @@ impl Graph {
     /// # Errors
     /// It is not open, or an edge is missing.
     pub fn close(&mut self, state: StateId) -> Result<(), GraphError> {
-        let next = match &self.known(state)?.kind {
-            Kind::Open { next } => next.iter().copied().collect::<Option<Vec<_>>>(),
-            other => return Err(GraphError::WrongKind(state, other.name(), "an open state")),
-        };
-        let next = next.ok_or(GraphError::NotTotal(state))?;
-        let commit = self.moments.len() as u64;
-        let entry = &mut self.states[state.index()];
-        entry.kind = Kind::Interior { next };
-        entry.interior_since = Some(commit);
-        self.interior[entry.pose.index()].push(state);
+        let State { kind, pose, .. } = self.known(state)?;
+        if kind != Kind::Open {
+            return Err(GraphError::WrongKind(state, kind.name(), "an open state"));
+        }
+        if !self.next(state).is_whole() {
+            return Err(GraphError::NotTotal(state));
+        }
+        self.nodes.close(state, self.moments.len() as u64);
+        Arc::make_mut(&mut self.interior[pose.index()]).push(state);
         self.open.remove(&state);
         Ok(())
     }
@@ -346,10 +357,7 @@ impl Graph {
         target: StateId,
         error_m: f32,
     ) -> Result<(), GraphError> {
-        let bare = match &self.known(state)?.kind {
-            Kind::Open { next } => next.iter().all(Option::is_none),
-            _ => false,
-        };
+        let bare = self.known(state)?.kind == Kind::Open && self.next(state).is_bare();
         if !bare {
             let is = self.state(state).kind.name();
             return Err(GraphError::WrongKind(state, is, "an open state without successors"));
@@ -375,10 +383,8 @@ impl Graph {
         self.forget(state, error_m);
         self.dead_ends[pose.index()].remove(&state);
         self.open.insert(state);
-        let next = vec![None; self.primary.out_degree(pose)];
-        let entry = &mut self.states[state.index()];
-        entry.kind = Kind::Open { next };
-        Ok(*entry.merges.last().expect("a dead end was merged"))
+        self.nodes.reopen(state);
+        Ok(*self.merges(state).last().expect("a dead end was merged"))
     }
 
     /// Moves a dead end to a nearer interior state, penalties included.
@@ -407,7 +413,7 @@ impl Graph {
     /// Ends a commit: what was done since the last is one step of the graph's history.
     pub fn end_commit(&mut self) {
         self.moments.push(Moment {
-            states: self.states.len() as u64,
+            states: self.nodes.count() as u64,
             runs: self.runs.len(),
             worst_error_m: self.queue.worst_m(),
             worst_cost_m: self.queue.worst_m().max(self.crossing.worst_m()),
@@ -435,15 +441,7 @@ impl Graph {
 
     fn push(&mut self, pose: PoseId, parent: Option<(StateId, EdgeId)>, class: Class) -> StateId {
         let id = self.next_id();
-        let next = vec![None; self.primary.out_degree(pose)];
-        self.states.push(State {
-            pose,
-            class,
-            parent,
-            kind: Kind::Open { next },
-            interior_since: None,
-            merges: Vec::new(),
-        });
+        self.nodes.push(pose, parent, class);
         self.open.insert(id);
         let job = self.moments.len() as u64;
         match self.runs.last_mut() {
@@ -465,9 +463,7 @@ impl Graph {
         if penalty_m > 0.0 {
             self.crossing.insert(state, error_m + penalty_m);
         }
-        let entry = &mut self.states[state.index()];
-        entry.kind = Kind::DeadEnd { target, error_m };
-        entry.merges.push(Merge { commit, target, error_m });
+        self.nodes.merge(state, Merge { commit, target, error_m });
     }
 
     /// Takes a dead end, which must still be one, off both queues.
@@ -479,8 +475,9 @@ impl Graph {
         }
     }
 
-    fn known(&self, state: StateId) -> Result<&State, GraphError> {
-        self.states.get(state.index()).ok_or(GraphError::NoState(state))
+    fn known(&self, state: StateId) -> Result<State, GraphError> {
+        let exists = state.0 < self.nodes.count() as u64;
+        exists.then(|| self.state(state)).ok_or(GraphError::NoState(state))
     }
 
     fn check_target(
@@ -490,7 +487,7 @@ impl Graph {
         error_m: f32,
     ) -> Result<(), GraphError> {
         let other = self.known(target)?;
-        if !matches!(other.kind, Kind::Interior { .. }) {
+        if other.kind != Kind::Interior {
             return Err(GraphError::WrongKind(target, other.kind.name(), "an interior state"));
         }
         if other.pose != self.state(state).pose {
@@ -514,8 +511,8 @@ impl Kind {
     /// In words, for messages.
     pub fn name(&self) -> &'static str {
         match self {
-            Self::Open { .. } => "open",
-            Self::Interior { .. } => "interior",
+            Self::Open => "open",
+            Self::Interior => "interior",
             Self::DeadEnd { .. } => "a dead end",
         }
     }

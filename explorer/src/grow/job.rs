@@ -5,10 +5,12 @@
 
 use std::collections::VecDeque;
 use std::io;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use protocol::{EdgeId, PoseId, StateId};
 
+use super::aim::Aims;
 use super::class::{self, Class, Classifier};
 use super::plan::{InitialJob, Plan};
 use super::similar::{Found, Similar};
@@ -46,10 +48,12 @@ pub struct Context<'a> {
     pub similar: &'a Similar,
     /// Tells a state's class.
     pub classifier: &'a Classifier,
-    /// Interior states of the snapshot by pose, by id.
-    pub known: &'a [Vec<StateId>],
+    /// Interior states of the snapshot by pose.
+    pub known: &'a [Arc<Vec<StateId>>],
     /// How to judge.
     pub rules: &'a Rules,
+    /// How far expansions go.
+    pub aims: &'a Aims,
     /// Most states of a job.
     pub states_max: usize,
     /// Set when jobs are to be dropped.
@@ -165,6 +169,7 @@ impl Expansion {
             edge: EdgeId(0),
             pose,
             depth: 0,
+            weight: 1.0,
             class: context.similar.class(start),
             state: context.states.read(start)?,
             interior: true,
@@ -212,6 +217,8 @@ struct Node {
     edge: EdgeId,
     pose: PoseId,
     depth: u32,
+    /// Of a merge here, against one of the start (see [`Aims`]).
+    weight: f32,
     class: Class,
     state: GridState,
     interior: bool,
@@ -239,8 +246,9 @@ impl Tree {
         let place = (edge, depth);
         let (state, class) = simulate(context, simulator, &from.state, place, &mut self.quality)?;
         let pose = context.primary.edge(edge).to;
+        let weight = context.aims.along(self.start, from.weight, edge);
         let parent = Some(parent);
-        self.nodes.push(Node { parent, edge, pose, depth, class, state, interior: false });
+        self.nodes.push(Node { parent, edge, pose, depth, weight, class, state, interior: false });
         Ok(self.nodes.len() - 1)
     }
 
@@ -249,7 +257,10 @@ impl Tree {
         if context.rules.paper {
             return Ok(false);
         }
-        Ok(self.most_similar(context, node, context.rules.tolerance_m)?.is_some())
+        let Node { pose, weight, .. } = self.nodes[node];
+        let enough_m = context.aims.enough_m(self.start, (self.nodes[0].pose, pose), weight);
+        let bound_m = enough_m.max(context.rules.tolerance_m);
+        Ok(self.most_similar(context, node, bound_m)?.is_some())
     }
 
     /// The paper's FindMostSimilar, among the snapshot and this tree.

@@ -11,13 +11,18 @@
 //! | n | payload: a [`Record`] in postcard |
 //! | 8 | first bytes of BLAKE3 over the record's offset (u64, little-endian) and the payload |
 //!
+//! Records that have grown many are **compacted**: a new journal with the same records, the newer of them packed
+//! into one, takes the old one's place in one step. So a journal is the header, packed records (a tenth of what
+//! they were), and a short tail; killed at any instant it is the old one or the new one.
+//!
 //! A record is on the disk before the next is written, so only the last can be torn: it is cut
 //! off when the journal is opened. A bad record with a good one behind it is damage, and refused.
 
 use std::fs::File;
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use super::compact;
 use super::files;
 use super::record::Record;
 
@@ -26,6 +31,10 @@ const MAGIC: &[u8; 8] = b"TOILEjl1";
 const RECORD_BYTES_MAX: usize = 16 << 20;
 const LENGTH_BYTES: usize = 4;
 const CHECK_BYTES: usize = 8;
+/// A tail of more bytes than this is compacted, unless another number is asked for.
+pub const TAIL_BYTES: u64 = 64 << 10;
+/// So much is copied at once.
+const COPY_BYTES: u64 = 1 << 20;
 
 /// Why a journal could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -51,6 +60,8 @@ pub struct Journal {
     file: File,
     path: PathBuf,
     end: u64,
+    /// Where records begin that are not packed, the header apart.
+    tail: u64,
 }
 
 impl Journal {
@@ -62,7 +73,8 @@ impl Journal {
         let mut bytes = MAGIC.to_vec();
         bytes.extend_from_slice(&frame(first, MAGIC.len() as u64)?);
         let file = files::create_whole(path, &bytes)?;
-        Ok(Self { file, path: path.to_owned(), end: bytes.len() as u64 })
+        let end = bytes.len() as u64;
+        Ok(Self { file, path: path.to_owned(), end, tail: end })
     }
 
     /// Opens a journal and hands every record to `each`, in order; cuts a torn tail off and says
@@ -82,7 +94,7 @@ impl Journal {
         if !whole || files::read_at(&file, &mut magic, 0).is_err() || &magic != MAGIC {
             return Err(JournalError::Foreign.into());
         }
-        let mut journal = Self { file, path: path.to_owned(), end: MAGIC.len() as u64 };
+        let mut journal = Self { file, path: path.to_owned(), end: MAGIC.len() as u64, tail: 0 };
         journal.replay(length, &mut each)?;
         let torn = journal.cut_tail(length)?;
         Ok((journal, torn))
@@ -104,7 +116,7 @@ impl Journal {
         if files::read_at(&file, &mut magic, 0).is_err() || &magic != MAGIC {
             return Err(JournalError::Foreign.into());
         }
-        let mut journal = Self { file, path: path.to_owned(), end: MAGIC.len() as u64 };
+        let mut journal = Self { file, path: path.to_owned(), end: MAGIC.len() as u64, tail: 0 };
         journal.replay(length, &mut each)
     }
 
@@ -116,9 +128,21 @@ impl Journal {
         let io = |error| E::from(JournalError::Io(error));
         while let Some(payload) = self.payload(self.end, length).map_err(io)? {
             let at = self.end;
-            let record = postcard::from_bytes(&payload).map_err(|_| JournalError::Unknown(at))?;
-            each(record)?;
+            let unknown = || E::from(JournalError::Unknown(at));
+            let record = postcard::from_bytes(&payload).map_err(|_| unknown())?;
             self.end += (LENGTH_BYTES + payload.len() + CHECK_BYTES) as u64;
+            let is_packed = matches!(record, Record::Compacted(_));
+            match record {
+                Record::Compacted(packed) => {
+                    for record in compact::unpack(&packed) {
+                        each(record.ok_or_else(unknown)?)?;
+                    }
+                }
+                record => each(record)?,
+            }
+            if is_packed || self.tail == 0 {
+                self.tail = self.end;
+            }
         }
         Ok(())
     }
@@ -132,6 +156,50 @@ impl Journal {
         files::write_at(&self.file, &bytes, self.end)?;
         self.file.sync_data()?;
         self.end += bytes.len() as u64;
+        Ok(())
+    }
+
+    /// Bytes of the records that are not packed, the header apart.
+    pub fn tail_bytes(&self) -> u64 {
+        self.end - self.tail
+    }
+
+    /// Bytes of the whole file.
+    pub fn bytes(&self) -> u64 {
+        self.end
+    }
+
+    /// Packs the records of the tail into one. `states`: how many the graph has by now.
+    ///
+    /// # Errors
+    /// The journal cannot be read or the new one not written: the old one is in its place and as it was.
+    pub fn compact(&mut self, states: u64) -> io::Result<()> {
+        let mut records = Vec::new();
+        let mut at = self.tail;
+        while let Some(payload) = self.payload(at, self.end)? {
+            records.push(postcard::from_bytes(&payload).map_err(io::Error::other)?);
+            at += (LENGTH_BYTES + payload.len() + CHECK_BYTES) as u64;
+        }
+        let frames = |record: &Record| match record {
+            Record::Job(job) => job.frames.len() as u64,
+            _ => 0,
+        };
+        let first = states.saturating_sub(records.iter().map(frames).sum());
+        let packed = compact::pack(&records, first).map_err(io::Error::other)?;
+        let packed = frame(&Record::Compacted(packed), self.tail)?;
+        let file = files::create_with(&self.path, |file| {
+            let mut at = 0;
+            while at < self.tail {
+                let mut bytes = vec![0; COPY_BYTES.min(self.tail - at) as usize];
+                files::read_at(&self.file, &mut bytes, at)?;
+                file.write_all(&bytes)?;
+                at += bytes.len() as u64;
+            }
+            file.write_all(&packed)
+        })?;
+        self.file = file;
+        self.end = self.tail + packed.len() as u64;
+        self.tail = self.end;
         Ok(())
     }
 
@@ -236,6 +304,31 @@ mod tests {
             assert_eq!(records.len(), (cut - 8) / size, "{cut}");
             assert_eq!(torn as usize, (cut - 8) % size);
             assert_eq!(std::fs::metadata(&path).unwrap().len() as usize, cut - torn as usize);
+        }
+    }
+
+    #[test]
+    fn a_compacted_journal_holds_the_same_records_and_goes_on() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("journal");
+        let mut journal = Journal::create(&path, &record(0)).unwrap();
+        let mut expected = vec![record(0)];
+        for index in 1..60 {
+            journal.append(&record(index)).unwrap();
+            expected.push(record(index));
+            if index % 17 == 0 {
+                let before = journal.bytes();
+                journal.compact(1).unwrap();
+                assert!(journal.tail_bytes() == 0 && journal.bytes() < before);
+            }
+            if index % 11 == 0 {
+                // Killed while it was compacted: what was begun is not looked at.
+                std::fs::write(folder.path().join("journal.new"), b"TOILE").unwrap();
+                let (again, torn) = Journal::open(&path, |_| Ok::<_, JournalError>(())).unwrap();
+                assert_eq!((torn, again.tail, again.end), (0, journal.tail, journal.end));
+                journal = again;
+            }
+            assert_eq!(read(&path).unwrap().0, expected);
         }
     }
 

@@ -9,6 +9,7 @@ use std::sync::Arc;
 
 use protocol::{PoseId, StateId};
 
+use super::aim::Aims;
 use super::class::Penalties;
 use super::graph::{Graph, GraphError, Kind};
 use super::plan::Plan;
@@ -29,7 +30,7 @@ pub enum Job {
 }
 
 /// Jobs chosen from one snapshot of the graph.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Round {
     /// Counted from 0.
     pub number: u64,
@@ -37,11 +38,18 @@ pub struct Round {
     pub snapshot: u64,
     /// In the order in which they are committed.
     pub jobs: Vec<Job>,
+    /// How far expansions go.
+    pub aims: Arc<Aims>,
     /// How many of them were committed or given up.
     pub done: usize,
 }
 
 impl Round {
+    /// Without a job.
+    fn empty(number: u64, snapshot: u64) -> Self {
+        Self { number, snapshot, jobs: Vec::new(), aims: Arc::default(), done: 0 }
+    }
+
     /// Whether all its jobs are done.
     pub fn is_done(&self) -> bool {
         self.done == self.jobs.len()
@@ -132,7 +140,7 @@ impl Ledger {
             draped: false,
             placed,
             rounds: 0,
-            round: Round { number: 0, snapshot: 0, jobs: Vec::new(), done: 0 },
+            round: Round::empty(0, 0),
             parked: None,
             set_aside: BTreeSet::new(),
             quality: FrameQuality::default(),
@@ -211,20 +219,22 @@ impl Ledger {
         self.placed[pose.index()]
     }
 
-    /// Interior states by pose, as they were at a commit, by id.
-    pub fn interior_at(&self, commit: u64) -> Vec<Vec<StateId>> {
-        let mut interior = vec![Vec::new(); self.placed.len()];
-        for (id, state) in self.graph.states().iter().enumerate() {
-            if state.interior_since.is_some_and(|since| since <= commit) {
-                interior[state.pose.index()].push(StateId(id as u64));
+    /// Interior states by pose, as they were at a commit; the lists are shared where nothing was added since.
+    pub fn interior_at(&self, commit: u64) -> Vec<Arc<Vec<StateId>>> {
+        let at = |pose: u32| {
+            let (all, then) = (self.graph.interior(PoseId(pose)), PoseId(pose));
+            match self.graph.interior_at(then, commit) {
+                part if part.len() == all.len() => Arc::clone(all),
+                part => Arc::new(part.to_vec()),
             }
-        }
-        interior
+        };
+        (0..self.placed.len() as u32).map(at).collect()
     }
 
     /// Chooses the jobs of the next round; false where there is nothing to do.
     pub fn open_round(&mut self) -> bool {
         assert!(self.round.is_done(), "the round before is not done");
+        let mut aims = Arc::default();
         let jobs = match self.phase() {
             Phase::Initial => self.ready(),
             Phase::Expansion => {
@@ -232,7 +242,13 @@ impl Ledger {
                 if tagged.is_empty() && self.unpark() {
                     return true;
                 }
-                if tagged.is_empty() { self.expansions() } else { tagged }
+                if tagged.is_empty() {
+                    let chosen = self.expansions();
+                    aims = Arc::new(self.steering.aims(&self.graph, &chosen));
+                    chosen.into_iter().map(Job::Expand).collect()
+                } else {
+                    tagged
+                }
             }
             Phase::Drape | Phase::Merge => Vec::new(),
         };
@@ -241,7 +257,7 @@ impl Ledger {
         }
         let number = self.rounds;
         self.rounds += 1;
-        self.round = Round { number, snapshot: self.graph.commit(), jobs, done: 0 };
+        self.round = Round { jobs, aims, ..Round::empty(number, self.graph.commit()) };
         true
     }
 
@@ -266,7 +282,7 @@ impl Ledger {
     /// The open round waits, and none is open.
     fn park(&mut self) {
         let Round { number, snapshot, .. } = self.round;
-        let none = Round { number, snapshot, jobs: Vec::new(), done: 0 };
+        let none = Round::empty(number, snapshot);
         self.parked = Some(std::mem::replace(&mut self.round, none));
     }
 
@@ -277,6 +293,7 @@ impl Ledger {
     pub fn apply(&mut self, record: &Record) -> Result<(), LedgerError> {
         match record {
             Record::Header(_) => Err(LedgerError::OutOfTurn("the header")),
+            Record::Compacted(_) => Err(LedgerError::OutOfTurn("packed records")),
             Record::Drape(drape) if !self.draped => {
                 self.draped = true;
                 self.graph.classify_drape(drape.class);
@@ -326,11 +343,10 @@ impl Ledger {
     }
 
     /// Dead ends to be expanded, by the policy.
-    fn expansions(&mut self) -> Vec<Job> {
+    fn expansions(&mut self) -> Vec<StateId> {
         let set_aside = &self.set_aside;
         let free = |state: StateId| !set_aside.contains(&state);
-        let chosen = self.steering.choose(&self.graph, self.round_jobs, &free);
-        chosen.into_iter().map(Job::Expand).collect()
+        self.steering.choose(&self.graph, self.round_jobs, &free)
     }
 
     fn apply_interruption(&mut self, tagged: &TagRecord) -> Result<(), LedgerError> {
@@ -389,11 +405,8 @@ impl Ledger {
         }
         let parents: BTreeSet<StateId> = record.frames.iter().map(|frame| frame.parent).collect();
         for parent in parents {
-            let whole = match &self.graph.state(parent).kind {
-                Kind::Open { next } => next.iter().all(Option::is_some),
-                _ => false,
-            };
-            if whole {
+            let is_open = self.graph.state(parent).kind == Kind::Open;
+            if is_open && self.graph.next(parent).is_whole() {
                 self.graph.close(parent)?;
             }
         }

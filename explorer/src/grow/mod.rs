@@ -12,14 +12,18 @@
 //! exploration is a function of the records, so a run that was killed goes on as if it had not
 //! been. A job's outcome depends on its inputs and on the snapshot of its round alone.
 
+pub mod aim;
 pub mod archive;
 pub mod class;
+mod compact;
 mod files;
 pub mod graph;
 pub mod job;
 pub mod journal;
+mod landmarks;
 pub mod ledger;
 pub mod metric;
+pub mod nodes;
 pub mod plan;
 pub mod policy;
 pub mod queue;

@@ -5,7 +5,7 @@
 //! `predictive` takes the largest error that a merge is expected to grow into, learnt from the
 //! merges undone so far. All add the penalty for crossing classes to the error. Under `visited` and
 //! `predictive` the first job of every round still goes to the globally worst merge, so that
-//! nothing starves.
+//! nothing starves; and expansions go only as far as they pay (see [`super::aim`]).
 //!
 //! A choice is a function of the records alone; what players walked enters as a record.
 
@@ -17,6 +17,7 @@ use std::sync::Arc;
 use protocol::{EdgeId, PoseId, StateId};
 use serde::{Deserialize, Serialize};
 
+use super::aim::Aims;
 use super::graph::Graph;
 use super::record::SteerRecord;
 use super::view::KindAt;
@@ -196,7 +197,7 @@ fn flow(
 ) {
     for (id, share) in (0..).map(StateId).zip(share) {
         let KindAt::Interior(next) = graph.kind_at(id, commit) else { continue };
-        for (edge, &child) in graph.primary().out_edges(graph.state(id).pose).zip(next) {
+        for (edge, child) in graph.primary().out_edges(graph.state(id).pose).zip(next.iter()) {
             let amount = share * probabilities[edge.index()];
             match graph.kind_at(child, commit) {
                 KindAt::DeadEnd(target, _) => each(Some(child), target, amount),
@@ -375,6 +376,16 @@ impl Steering {
         chosen
     }
 
+    /// How far the expansions of these dead ends go, the first of them being the worst of all.
+    pub fn aims(&self, graph: &Graph, chosen: &[StateId]) -> Aims {
+        let aims = || Aims::new(graph, chosen, chosen.first().copied());
+        match self.policy {
+            Policy::Greedy => Aims::default(),
+            Policy::Visited => aims().weighed_by(graph, &self.model),
+            Policy::Predictive => aims().grown_by(graph, &self.growth),
+        }
+    }
+
     fn by_visits(&self, graph: &Graph, open: &[(StateId, f64)]) -> Vec<(StateId, f64)> {
         let visits: Vec<f64> =
             open.iter().map(|(state, _)| self.visits_of(graph, *state)).collect();
@@ -387,7 +398,7 @@ impl Steering {
 
     /// Computes visits afresh where the graph or the model has moved on.
     fn look(&mut self, graph: &Graph) {
-        let states = graph.states().len();
+        let states = graph.next_id().0 as usize;
         let fresh = self.visits.len() as f64 > (1.0 - VISITS_STALE) * states as f64;
         if self.stale || !fresh {
             self.visits = visits(graph, &self.model, &self.visits);

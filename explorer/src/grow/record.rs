@@ -33,6 +33,8 @@ pub enum Record {
     Tagged(TagRecord),
     /// The same while a round was under way: what is left of it waits until theirs is done.
     Interrupted(TagRecord),
+    /// Many of the others, packed (see [`super::journal`]); only the journal sees this one.
+    Compacted(Vec<u8>),
 }
 
 /// Tags that were read.

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use protocol::{PoseId, StateId};
 
+use super::aim::Aims;
 use super::class::Classifier;
 use super::job::{
     self, Context, Expansion, JOB_STATES_MAX, JobError, Outcome, Rules, TAGGED_STATES_MAX,
@@ -35,6 +36,8 @@ pub enum Ended {
     Stopped,
     /// People pointed at something: what is not committed waits in [`Paused`].
     Interrupted(TagRecord),
+    /// There are as many simulated frames as were asked for: jobs in flight were dropped.
+    Frames,
 }
 
 /// Why a round could not go on.
@@ -63,7 +66,7 @@ pub struct Paused {
 
 /// Runs what is left of the open round. `tags` is asked again and again once the initial pass is over,
 /// unless the round is one of tags itself: what people pointed at interrupts it between two frames of its
-/// jobs. `each` is called after every job that was committed, or given up (with the reason).
+/// jobs. An expansion round ends after the job with which there are `frames` simulated frames. `each` is called after every job that was committed, or given up (with the reason).
 ///
 /// # Errors
 /// The work folder cannot be read or written, or a frame of the initial pass cannot be simulated.
@@ -72,6 +75,7 @@ pub async fn run(
     simulators: &mut Vec<Box<dyn Simulator>>,
     paused: &mut Paused,
     (should_stop, tags): (&dyn Fn() -> bool, impl AsyncFnMut() -> Option<TagRecord>),
+    frames: Option<u64>,
     each: &mut dyn FnMut(&Work, Option<&JobError>),
 ) -> Result<Ended, RoundError> {
     let round = work.ledger().round().number;
@@ -88,7 +92,7 @@ pub async fn run(
     }
     let shared = Arc::new(Shared::new(work, simulators, left, under_way));
     let workers = Workers::start(&shared, simulators);
-    let ended = collect(work, &workers, &mut early, (should_stop, tags), each).await;
+    let ended = collect(work, &workers, &mut early, (should_stop, tags), frames, each).await;
     // Also on an error: workers still running are not waited for longer than a frame.
     let rest = workers.join(simulators);
     if matches!(ended, Ok(Ended::Interrupted(_))) {
@@ -138,8 +142,9 @@ struct Shared {
     states: Arc<StateFile>,
     similar: Arc<Similar>,
     classifier: Arc<Classifier>,
-    known: Vec<Vec<StateId>>,
+    known: Vec<Arc<Vec<StateId>>>,
     rules: Rules,
+    aims: Arc<Aims>,
     states_max: usize,
     retries: bool,
     starts: Vec<Option<Start>>,
@@ -165,6 +170,7 @@ impl Shared {
             classifier: Arc::clone(work.classifier()),
             known: ledger.interior_at(ledger.round().snapshot),
             rules: *work.rules(),
+            aims: Arc::clone(&ledger.round().aims),
             states_max: if tagged { TAGGED_STATES_MAX } else { JOB_STATES_MAX },
             retries: simulators.iter().any(|simulator| simulator.may_recover()),
             starts,
@@ -183,6 +189,7 @@ impl Shared {
             classifier: &self.classifier,
             known: &self.known,
             rules: &self.rules,
+            aims: &self.aims,
             states_max: self.states_max,
             abandon: &self.abandon,
         }
@@ -310,6 +317,7 @@ async fn collect(
     workers: &Workers,
     early: &mut Early,
     (should_stop, mut tags): (&dyn Fn() -> bool, impl AsyncFnMut() -> Option<TagRecord>),
+    frames: Option<u64>,
     each: &mut dyn FnMut(&Work, Option<&JobError>),
 ) -> Result<Ended, RoundError> {
     let ledger = work.ledger();
@@ -320,6 +328,9 @@ async fn collect(
                 Ok(outcome) => {
                     work.commit(&outcome)?;
                     each(work, None);
+                    if work.ledger().round().is_done() || enough(work, frames) {
+                        break;
+                    }
                 }
                 Err(error) => match give_up(work, error)? {
                     Some(error) => each(work, Some(&error)),
@@ -329,6 +340,9 @@ async fn collect(
         }
         if work.ledger().round().is_done() {
             return Ok(Ended::Done);
+        }
+        if enough(work, frames) {
+            return Ok(Ended::Frames);
         }
         if may_wait && let Some(tags) = tags().await {
             return Ok(Ended::Interrupted(tags));
@@ -345,6 +359,12 @@ async fn collect(
             workers.shared.abandon.store(true, Ordering::Relaxed);
         }
     }
+}
+
+/// Whether there are as many frames as were asked for, in a whole graph.
+fn enough(work: &Work, frames: Option<u64>) -> bool {
+    let reached = frames.is_some_and(|frames| work.graph().simulated_frames() >= frames);
+    reached && work.ledger().phase() == Phase::Expansion
 }
 
 /// Records a job that failed; `None` where it was only dropped.

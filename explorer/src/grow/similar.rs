@@ -7,21 +7,20 @@
 
 use std::io;
 use std::path::Path;
-use std::sync::{PoisonError, RwLock};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use cloth::Vec3;
 use protocol::StateId;
 
 use super::class::{Class, Penalties};
+use super::landmarks::{LANDMARK_BYTES_MAX, Pages, Row};
 use super::metric::Metric;
 use super::states::StateFile;
 use crate::grid::GridState;
 use crate::scene::Scene;
 
-/// Vertices kept of every state: 288 bytes of memory a state.
+/// Vertices kept of every state: 288 bytes a state, in a file of which a part is in memory.
 pub const LANDMARKS: usize = 24;
-
-type Row = [i16; 6];
 
 /// Everything a search needs.
 #[derive(Debug)]
@@ -32,12 +31,12 @@ pub struct Similar {
     vertices: Vec<u32>,
     vertex_count: usize,
     file: Option<StateFile>,
-    kept: RwLock<Kept>,
+    kept: Mutex<Kept>,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Kept {
-    rows: Vec<Row>,
+    pages: Pages,
     classes: Vec<Class>,
 }
 
@@ -64,6 +63,7 @@ impl Similar {
     pub fn new(scene: &Scene) -> Self {
         let metric = Metric::of_scene(scene);
         let vertices = spread(&scene.garment.positions, LANDMARKS);
+        let pages = Pages::new(vertices.len(), 0, LANDMARK_BYTES_MAX);
         Self {
             few: metric.of_vertices(&vertices),
             metric,
@@ -71,7 +71,7 @@ impl Similar {
             vertex_count: scene.garment.positions.len(),
             vertices,
             file: None,
-            kept: RwLock::default(),
+            kept: Mutex::new(Kept { pages, classes: Vec::new() }),
         }
     }
 
@@ -99,27 +99,15 @@ impl Similar {
                 file
             }
         };
-        let mut rows = Vec::with_capacity(classes.len() * self.vertices.len());
-        for id in (0..count).map(StateId) {
-            let few = file.read(id)?;
-            rows.extend(few.positions.iter().zip(&few.velocities).map(|(p, v)| row(*p, *v)));
-        }
         self.file = Some(file);
-        self.kept = RwLock::new(Kept { rows, classes });
+        self.keep_all(classes);
         Ok(())
     }
 
-    /// As [`Similar::open`], but changes nothing on the disk.
-    ///
-    /// # Errors
-    /// The states cannot be read.
-    pub fn keep_all(&mut self, states: &StateFile, classes: Vec<Class>) -> io::Result<()> {
-        let mut rows = Vec::with_capacity(classes.len() * self.vertices.len());
-        for id in (0..classes.len() as u64).map(StateId) {
-            self.push_rows(&mut rows, &states.read(id)?);
-        }
-        self.kept = RwLock::new(Kept { rows, classes });
-        Ok(())
+    /// Knows the states whose classes these are; without a file their landmarks are cut from the states.
+    pub fn keep_all(&mut self, classes: Vec<Class>) {
+        let pages = Pages::new(self.vertices.len(), classes.len(), LANDMARK_BYTES_MAX);
+        self.kept = Mutex::new(Kept { pages, classes });
     }
 
     /// Adds states, the first of them with the id `first`; on the disk when it returns.
@@ -127,15 +115,14 @@ impl Similar {
     /// # Errors
     /// The file cannot be written.
     pub fn add(&self, first: StateId, states: &[GridState], classes: &[Class]) -> io::Result<()> {
+        let few: Vec<GridState> = states.iter().map(|state| self.cut(state)).collect();
         if let Some(file) = &self.file {
-            let few: Vec<GridState> = states.iter().map(|state| self.cut(state)).collect();
             file.write(first, &few)?;
         }
-        let mut kept = self.kept.write().unwrap_or_else(PoisonError::into_inner);
+        let mut kept = self.kept();
+        kept.pages.add(first, &few);
         // What an attempt before left that was never recorded.
-        kept.rows.truncate(first.index() * self.vertices.len());
         kept.classes.truncate(first.index());
-        states.iter().for_each(|state| self.push_rows(&mut kept.rows, state));
         kept.classes.extend_from_slice(classes);
         Ok(())
     }
@@ -147,8 +134,16 @@ impl Similar {
 
     /// The class of a state that was added.
     pub fn class(&self, state: StateId) -> Class {
-        let kept = self.kept.read().unwrap_or_else(PoisonError::into_inner);
-        kept.classes[state.index()]
+        self.kept().classes[state.index()]
+    }
+
+    /// Bytes of memory that landmarks take: at most [`LANDMARK_BYTES_MAX`], about.
+    pub fn landmark_bytes(&self) -> usize {
+        self.kept().pages.bytes()
+    }
+
+    fn kept(&self) -> MutexGuard<'_, Kept> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// What merges between classes cost.
@@ -168,7 +163,7 @@ impl Similar {
         candidates: &[StateId],
         bound_m: f32,
     ) -> io::Result<Option<Found<StateId>>> {
-        let mut order = self.order((state, class), candidates, bound_m);
+        let mut order = self.order(states, (state, class), candidates, bound_m)?;
         order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let mut best: Option<Found<StateId>> = None;
         for (least_m, candidate, penalty_m) in order {
@@ -203,48 +198,51 @@ impl Similar {
         (cost_m <= bound_m).then_some((error_m, cost_m))
     }
 
-    /// The least that merging could cost (m), from the landmarks; both states are kept.
-    pub fn least_cost(&self, from: StateId, to: StateId) -> f32 {
-        let kept = self.kept.read().unwrap_or_else(PoisonError::into_inner);
-        let least_m = self.few.least_distance(
-            self.rows(&kept, from),
-            self.rows(&kept, to),
-            self.vertex_count,
-        );
-        least_m + self.penalties.of(kept.classes[from.index()], kept.classes[to.index()])
+    /// The least that merging could cost (m), from the landmarks.
+    ///
+    /// # Errors
+    /// A state could not be read.
+    pub fn least_cost(&self, states: &StateFile, from: StateId, to: StateId) -> io::Result<f32> {
+        let mut kept = self.kept();
+        let read = |first, count| self.read(states, first, count);
+        let own = kept.pages.rows(from, &read)?.to_vec();
+        let least_m = self.few.least_distance(&own, kept.pages.rows(to, &read)?, self.vertex_count);
+        let classes = &kept.classes;
+        Ok(least_m + self.penalties.of(classes[from.index()], classes[to.index()]))
     }
 
     /// Candidates with the least that each could cost, and its penalty (m), without those above
     /// the bound.
     fn order(
         &self,
+        states: &StateFile,
         (state, class): (&GridState, Class),
         candidates: &[StateId],
         bound_m: f32,
-    ) -> Vec<(f32, StateId, f32)> {
-        let mut own = Vec::with_capacity(self.vertices.len());
-        self.push_rows(&mut own, state);
-        let kept = self.kept.read().unwrap_or_else(PoisonError::into_inner);
-        let mut order = Vec::with_capacity(candidates.len());
+    ) -> io::Result<Vec<(f32, StateId, f32)>> {
+        let of = |v: &u32| row(state.positions[*v as usize], state.velocities[*v as usize]);
+        let own: Vec<Row> = self.vertices.iter().map(of).collect();
+        let read = |first, count| self.read(states, first, count);
+        let mut kept = self.kept();
+        let mut order = Vec::new();
         for &candidate in candidates {
-            let rows = self.rows(&kept, candidate);
             let penalty_m = self.penalties.of(class, kept.classes[candidate.index()]);
+            let rows = kept.pages.rows(candidate, &read)?;
             let least_m = self.few.least_distance(&own, rows, self.vertex_count) + penalty_m;
             if least_m <= bound_m {
                 order.push((least_m, candidate, penalty_m));
             }
         }
-        order
+        Ok(order)
     }
 
-    fn rows<'a>(&self, kept: &'a Kept, state: StateId) -> &'a [Row] {
-        let size = self.vertices.len();
-        &kept.rows[state.index() * size..(state.index() + 1) * size]
-    }
-
-    fn push_rows(&self, rows: &mut Vec<Row>, state: &GridState) {
-        let of = |v: &u32| row(state.positions[*v as usize], state.velocities[*v as usize]);
-        rows.extend(self.vertices.iter().map(of));
+    /// The landmarks of `count` states from an id on.
+    fn read(&self, states: &StateFile, first: StateId, count: usize) -> io::Result<Vec<GridState>> {
+        if let Some(file) = &self.file {
+            return file.read_run(first, count);
+        }
+        let cut = |id: u64| states.read(StateId(id)).map(|state| self.cut(&state));
+        (first.0..first.0 + count as u64).map(cut).collect()
     }
 
     fn cut(&self, state: &GridState) -> GridState {
@@ -351,14 +349,18 @@ mod tests {
                 prop_assert_eq!(found, (brute.0 <= bound_m).then_some(brute));
             }
             for id in &candidates {
-                prop_assert!(similar.least_cost(StateId(0), *id) <= cost(id));
+                prop_assert!(similar.least_cost(&file, StateId(0), *id).unwrap() <= cost(id));
             }
             // Opened again, from the file and without it, it knows the same.
             for _ in 0..2 {
                 let mut again = Similar::new(&scene);
                 again.open(&path, &[0; 32], &file, all_classes.clone()).unwrap();
-                let kept = |similar: &Similar| similar.kept.read().unwrap().rows.clone();
-                prop_assert_eq!(kept(&again), kept(&similar));
+                for id in (0..all.len() as u64).map(StateId) {
+                    let bits = |similar: &Similar| {
+                        similar.least_cost(&file, StateId(0), id).unwrap().to_bits()
+                    };
+                    prop_assert_eq!(bits(&again), bits(&similar));
+                }
                 std::fs::remove_file(&path).unwrap();
             }
         }
@@ -408,7 +410,7 @@ mod tests {
         let file = StateFile::create(&path, VERTICES as u32, &[0; 32]).unwrap();
         file.write(StateId(0), &all).unwrap();
         let mut similar = Similar::new(&scene);
-        similar.keep_all(&file, vec![0; all.len()]).unwrap();
+        similar.keep_all(vec![0; all.len()]);
         let candidates: Vec<StateId> = (0..1000).map(StateId).collect();
         for (what, bound_m) in [("near a known state", 0.01), ("nearest", f32::INFINITY)] {
             let clock = crate::cpu::CpuClock::start();

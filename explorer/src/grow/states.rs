@@ -151,11 +151,25 @@ impl StateFile {
     pub fn read(&self, state: StateId) -> io::Result<GridState> {
         let mut bytes = vec![0; self.vertex_count * VERTEX_BYTES];
         files::read_at(&self.file, &mut bytes, self.offset(state))?;
+        Ok(self.parse(&bytes))
+    }
+
+    fn parse(&self, bytes: &[u8]) -> GridState {
         let step = |b: &[u8], axis: usize| i16::from_le_bytes([b[2 * axis], b[2 * axis + 1]]);
         let rows = bytes.chunks_exact(6).map(|b| [step(b, 0), step(b, 1), step(b, 2)]);
         let mut positions: Vec<[i16; 3]> = rows.collect();
         let velocities = positions.split_off(self.vertex_count);
-        Ok(GridState { positions, velocities })
+        GridState { positions, velocities }
+    }
+
+    /// Reads `count` states, the first of them with this id, at once.
+    ///
+    /// # Errors
+    /// They cannot be read.
+    pub fn read_run(&self, first: StateId, count: usize) -> io::Result<Vec<GridState>> {
+        let mut bytes = vec![0; count * self.vertex_count * VERTEX_BYTES];
+        files::read_at(&self.file, &mut bytes, self.offset(first))?;
+        Ok(bytes.chunks_exact(self.vertex_count * VERTEX_BYTES).map(|b| self.parse(b)).collect())
     }
 
     fn offset(&self, state: StateId) -> u64 {

@@ -10,6 +10,7 @@ use protocol::manifest::VersionStats;
 use protocol::{EdgeId, StateId};
 
 use super::graph::{Graph, Kind};
+use super::nodes::Next;
 use super::states::StateFile;
 use crate::view::{GraphView, Run};
 
@@ -19,7 +20,7 @@ pub enum KindAt<'a> {
     /// Not yet created.
     Later,
     /// Interior, with the state simulated on each out-edge.
-    Interior(&'a [StateId]),
+    Interior(Next<'a>),
     /// Merged into a state, at a distance (m).
     DeadEnd(StateId, f32),
 }
@@ -39,12 +40,11 @@ impl Graph {
             return KindAt::Later;
         }
         let entry = self.state(state);
-        if entry.interior_since.is_some_and(|since| since <= commit)
-            && let Kind::Interior { next } = &entry.kind
+        if entry.interior_since.is_some_and(|since| since <= commit) && entry.kind == Kind::Interior
         {
-            return KindAt::Interior(next);
+            return KindAt::Interior(self.next(state));
         }
-        let merge = entry.merges.iter().rev().find(|merge| merge.commit <= commit);
+        let merge = self.merges(state).iter().rev().find(|merge| merge.commit <= commit);
         let merge = merge.expect("a state of a total graph is interior or merged");
         KindAt::DeadEnd(merge.target, merge.error_m)
     }
@@ -96,9 +96,10 @@ impl<'a> View<'a> {
             unreachable!("state {state} is interior")
         };
         let slot = self.graph.slot(state, edge).expect("an edge of the state's pose");
-        match self.kind(next[slot]) {
+        let next = next.get(slot).expect("an interior state has all its successors");
+        match self.kind(next) {
             KindAt::DeadEnd(target, _) => target,
-            KindAt::Interior(_) | KindAt::Later => next[slot],
+            KindAt::Interior(_) | KindAt::Later => next,
         }
     }
 
@@ -106,7 +107,7 @@ impl<'a> View<'a> {
     fn successors(&self) -> Vec<StateId> {
         let first = self.graph.moments()[self.commit as usize].states;
         let mut successors: Vec<StateId> = Vec::new();
-        for state in &self.graph.states()[first as usize..] {
+        for state in self.graph.states().skip(first as usize) {
             let (parent, edge) = state.parent.expect("only the drape has no parent");
             let base = match self.kind(parent) {
                 KindAt::Later => successors[(parent.0 - first) as usize],
@@ -140,8 +141,10 @@ impl GraphView for View<'_> {
     fn links(&self) -> Vec<LinkEntry> {
         let first_later = self.graph.moments()[self.commit as usize].states;
         let successors = self.successors();
-        let entry = |(id, state): (u64, &super::graph::State)| match self.kind(StateId(id)) {
-            KindAt::Interior(next) => LinkEntry::Interior { pose: state.pose, next: next.into() },
+        let entry = |(id, state): (u64, super::graph::State)| match self.kind(StateId(id)) {
+            KindAt::Interior(next) => {
+                LinkEntry::Interior { pose: state.pose, next: next.iter().collect() }
+            }
             KindAt::DeadEnd(target, error_m) => {
                 LinkEntry::DeadEnd { pose: state.pose, target, error_m }
             }

@@ -16,7 +16,7 @@ use super::class::{self, Class, Classifier};
 use super::files;
 use super::graph::{Graph, Kind};
 use super::job::{Local, LocalFrame, Outcome, Rules};
-use super::journal::{Journal, JournalError};
+use super::journal::{Journal, JournalError, TAIL_BYTES};
 use super::ledger::{Job, Ledger, LedgerError};
 use super::record::{
     DrapeRecord, FailedRecord, FrameRecord, Header, JobRecord, MergeRecord, PublishRecord, Record,
@@ -97,6 +97,8 @@ pub struct Work {
     rules: Rules,
     simulate_cpu: File,
     simulate_cpu_s: f64,
+    /// The journal is compacted when its tail is longer.
+    tail_bytes: u64,
     _lock: File,
 }
 
@@ -106,6 +108,19 @@ impl Work {
     /// # Errors
     /// It is in use, was made for other inputs, was damaged, or cannot be read or written.
     pub fn open(folder: &Path, scene: &Scene, paper: bool) -> Result<Self, WorkError> {
+        Self::open_with(folder, scene, paper, TAIL_BYTES)
+    }
+
+    /// As [`Work::open`]; the journal is compacted whenever its tail has more than so many bytes.
+    ///
+    /// # Errors
+    /// As for [`Work::open`].
+    pub fn open_with(
+        folder: &Path,
+        scene: &Scene,
+        paper: bool,
+        tail_bytes: u64,
+    ) -> Result<Self, WorkError> {
         std::fs::create_dir_all(folder).map_err(at(folder))?;
         let lock = lock(&folder.join("lock"))?;
         let header = Header::new(scene, paper);
@@ -129,7 +144,7 @@ impl Work {
         let mut similar = Similar::new(scene);
         let classes = match ledger.phase() {
             super::ledger::Phase::Drape => Vec::new(),
-            _ => ledger.graph().states().iter().map(|state| state.class).collect(),
+            _ => ledger.graph().states().map(|state| state.class).collect(),
         };
         let path = folder.join("landmarks");
         similar.open(&path, &digest, &states, classes).map_err(at(&path))?;
@@ -140,7 +155,7 @@ impl Work {
             Rules { tolerance_m: e.tolerance_m, depth_frames: e.depth_frames.max(1), paper };
         let states = Arc::new(states);
         let folder = folder.to_owned();
-        Ok(Self {
+        let mut work = Self {
             folder,
             ledger,
             journal,
@@ -150,8 +165,11 @@ impl Work {
             rules,
             simulate_cpu,
             simulate_cpu_s,
+            tail_bytes,
             _lock: lock,
-        })
+        };
+        work.compact()?;
+        Ok(work)
     }
 
     /// Graph and bookkeeping.
@@ -182,6 +200,11 @@ impl Work {
     /// How jobs are judged.
     pub fn rules(&self) -> &Rules {
         &self.rules
+    }
+
+    /// The journal.
+    pub fn journal(&self) -> &Journal {
+        &self.journal
     }
 
     /// CPU seconds spent in jobs, over all runs; a killed run's last seconds may be missing.
@@ -417,8 +440,11 @@ impl Work {
     ) -> io::Result<Option<MergeRecord>> {
         let (mut cost_m, mut best) = (self.graph().cost_m(dead_end), None);
         let similar = &self.similar;
-        let least_m = |target: &StateId| similar.least_cost(dead_end, *target);
-        if candidates.iter().all(|(_, target, _)| least_m(target) >= cost_m) {
+        let mut near = false;
+        for (_, target, _) in candidates {
+            near = near || similar.least_cost(&self.states, dead_end, *target)? < cost_m;
+        }
+        if !near {
             return Ok(best);
         }
         let frame = self.states.read(dead_end)?;
@@ -448,7 +474,18 @@ impl Work {
     fn record(&mut self, record: &Record) -> Result<(), WorkError> {
         self.journal.append(record).map_err(at(self.journal.path()))?;
         let path = self.journal.path().to_owned();
-        self.ledger.apply(record).map_err(|source| WorkError::Records { path, source })
+        self.ledger.apply(record).map_err(|source| WorkError::Records { path, source })?;
+        self.compact()
+    }
+
+    /// Compacts the journal where its tail is long: at places that the records give, so that a run that was
+    /// killed leaves the same journal.
+    fn compact(&mut self) -> Result<(), WorkError> {
+        if self.journal.tail_bytes() <= self.tail_bytes {
+            return Ok(());
+        }
+        let states = self.graph().next_id().0;
+        self.journal.compact(states).map_err(at(self.journal.path()))
     }
 }
 
