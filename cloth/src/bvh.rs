@@ -2,17 +2,26 @@
 
 use glam::{Vec3, Vec3A};
 
+use crate::solver::simd::{self, Set, Task};
 use crate::triangle::{self, OnTriangle};
+use crate::wide::{self, Boxes, Corners, WIDE};
 
-const LEAF_TRIANGLES: usize = 4;
 /// Deep enough for 2^32 triangles halved at the median.
 const STACK: usize = 64;
+/// The same for the wide nodes: of each, all children but the one gone into may wait.
+const WIDE_STACK: usize = 96;
+/// In [`Wide::links`]: a leaf.
+const LEAF: u32 = 1 << 31;
 
 /// The tree's shape, which no pose changes. Nodes lie depth first: a left child follows its
 /// parent.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bvh {
     nodes: Vec<Node>,
+    /// Three levels of `nodes` in one; the first is the root.
+    wide: Vec<Wide>,
+    /// First triangle of each leaf in `order`, and how many it has.
+    leaves: Vec<[u32; 2]>,
     /// Triangles in the order of the leaves.
     order: Vec<u32>,
     /// Vertices of the triangles in that order.
@@ -29,11 +38,26 @@ pub(crate) struct Node {
     pub(crate) count: u32,
 }
 
+/// A node of up to eight children.
+#[derive(Debug, Clone, PartialEq)]
+struct Wide {
+    /// Its children among the binary nodes.
+    nodes: [u32; WIDE],
+    /// Where they are: wide nodes, or leaves with [`LEAF`].
+    links: [u32; WIDE],
+    /// Bit by bit the lanes in which there is one.
+    lanes: u32,
+}
+
 /// The tree fitted to one pose.
 #[derive(Debug, Clone, Default)]
 pub struct Fit {
     boxes: Vec<[Vec3A; 2]>,
     corners: Vec<[Vec3A; 3]>,
+    /// Children's boxes of each wide node.
+    wide_boxes: Vec<Boxes>,
+    /// Corners of each leaf.
+    wide_corners: Vec<Corners>,
 }
 
 /// The closest point of a mesh.
@@ -50,13 +74,43 @@ pub struct Hit {
 impl Bvh {
     /// Splits at the median of the longer side of the centroids' box, until leaves are small.
     pub fn new(positions: &[Vec3], triangles: &[[u32; 3]]) -> Self {
-        let (nodes, order) = split(positions, triangles);
+        let (nodes, order) = split(positions, triangles, WIDE);
         let corners = order.iter().map(|t| triangles[*t as usize]).collect();
         let mut places = vec![0; order.len()];
         for (place, t) in order.iter().enumerate() {
             places[*t as usize] = place as u32;
         }
-        Self { nodes, order, corners, places }
+        let mut tree = Self { nodes, wide: Vec::new(), leaves: Vec::new(), order, corners, places };
+        if !tree.nodes.is_empty() {
+            tree.widen(0);
+        }
+        tree
+    }
+
+    /// Makes the wide node of a binary one and all below; returns its number.
+    fn widen(&mut self, node: u32) -> u32 {
+        let mut children = vec![node];
+        for _ in 0..WIDE.ilog2() {
+            let open = |n: &u32| match self.nodes[*n as usize] {
+                Node { count: 0, link } => vec![*n + 1, link],
+                _ => vec![*n],
+            };
+            children = children.iter().flat_map(open).collect();
+        }
+        let me = self.wide.len();
+        self.wide.push(Wide { nodes: [0; WIDE], links: [0; WIDE], lanes: 0 });
+        for (lane, child) in children.into_iter().enumerate() {
+            let Node { link, count } = self.nodes[child as usize];
+            self.wide[me].nodes[lane] = child;
+            self.wide[me].lanes |= 1 << lane;
+            self.wide[me].links[lane] = if count > 0 {
+                self.leaves.push([link, count]);
+                (self.leaves.len() - 1) as u32 | LEAF
+            } else {
+                self.widen(child)
+            };
+        }
+        me as u32
     }
 
     /// Boxes and corners of the mesh in another pose; no allocation once `fit` is warm.
@@ -76,6 +130,17 @@ impl Bvh {
                 leaf.iter().flatten().fold(start, |b, p| [b[0].min(*p), b[1].max(*p)])
             };
         }
+        fit.wide_boxes.resize(self.wide.len(), Boxes::NOWHERE);
+        for (wide, boxes) in self.wide.iter().zip(&mut fit.wide_boxes) {
+            for lane in (0..WIDE).filter(|lane| wide.lanes >> lane & 1 == 1) {
+                boxes.set(lane, &fit.boxes[wide.nodes[lane] as usize]);
+            }
+        }
+        fit.wide_corners.resize(self.leaves.len(), Corners::NOWHERE);
+        for ([first, count], leaf) in self.leaves.iter().zip(&mut fit.wide_corners) {
+            let there = &fit.corners[*first as usize..][..*count as usize];
+            there.iter().enumerate().for_each(|(lane, corners)| leaf.set(lane, corners));
+        }
     }
 
     /// The closest point nearer than `sqrt(limit2)`, if there is one. Of equals the one that
@@ -92,57 +157,8 @@ impl Bvh {
         limit2: f32,
         near: Option<u32>,
     ) -> Option<Hit> {
-        let point = Vec3A::from(point);
-        let mut best = limit2;
-        let mut hit = None;
-        if let Some(triangle) = near {
-            let on =
-                triangle::closest(&fit.corners[self.places[triangle as usize] as usize], point);
-            let distance2 = on.point.distance_squared(point);
-            if distance2 < best {
-                best = distance2;
-                hit = Some(Hit { triangle, on, distance2 });
-            }
-        }
-        let mut stack = [(0u32, 0.0f32); STACK];
-        let mut depth = 0;
-        if !self.nodes.is_empty() {
-            stack[0] = (0, box_distance2(&fit.boxes[0], point));
-            depth = 1;
-        }
-        while depth > 0 {
-            depth -= 1;
-            let (mut at, mut distance2) = stack[depth];
-            while distance2 < best {
-                let node = self.nodes[at as usize];
-                if node.count > 0 {
-                    for slot in node.link..node.link + node.count {
-                        let on = triangle::closest(&fit.corners[slot as usize], point);
-                        let d2 = on.point.distance_squared(point);
-                        if d2 < best {
-                            best = d2;
-                            let triangle = self.order[slot as usize];
-                            hit = Some(Hit { triangle, on, distance2: d2 });
-                        }
-                    }
-                    break;
-                }
-                let (left, right) = (at + 1, node.link);
-                let to_left = box_distance2(&fit.boxes[left as usize], point);
-                let to_right = box_distance2(&fit.boxes[right as usize], point);
-                let (near, far) = if to_left <= to_right {
-                    ((left, to_left), (right, to_right))
-                } else {
-                    ((right, to_right), (left, to_left))
-                };
-                if far.1 < best {
-                    stack[depth] = far;
-                    depth += 1;
-                }
-                (at, distance2) = near;
-            }
-        }
-        hit
+        let (set, point) = (Set::detect(), point.into());
+        simd::run(Search { tree: self, fit, point, limit2, near, set })
     }
 
     /// How many times a closed mesh winds around `point`: 0 outside, 1 inside, 2 where two parts
@@ -173,21 +189,124 @@ impl Bvh {
     }
 }
 
-/// Nodes of a tree over triangles, and the triangles in the order of its leaves.
-pub(crate) fn split(positions: &[Vec3], triangles: &[[u32; 3]]) -> (Vec<Node>, Vec<u32>) {
+/// Looks for the closest point, nearest children first.
+struct Search<'a> {
+    tree: &'a Bvh,
+    fit: &'a Fit,
+    point: Vec3A,
+    limit2: f32,
+    near: Option<u32>,
+    set: Set,
+}
+
+impl Task for Search<'_> {
+    type Output = Option<Hit>;
+
+    #[inline(always)]
+    fn run(self) -> Option<Hit> {
+        let mut found = Found { best: self.limit2, hit: None };
+        if let Some(triangle) = self.near {
+            self.look(self.tree.places[triangle as usize], &mut found);
+        }
+        let mut stack = [(0u32, 0.0f32); WIDE_STACK];
+        let mut depth = usize::from(!self.tree.wide.is_empty());
+        while depth > 0 {
+            depth -= 1;
+            let (link, distance2) = stack[depth];
+            if distance2 >= found.best {
+                continue;
+            }
+            if link & LEAF != 0 {
+                self.look_at_leaf((link & !LEAF) as usize, &mut found);
+                continue;
+            }
+            let at = link as usize;
+            let to = simd::box_distances2(self.set, &self.fit.wide_boxes[at], self.point);
+            let first = depth;
+            let mut nearer = to.below(found.best) & self.tree.wide[at].lanes;
+            while nearer != 0 {
+                let lane = nearer.trailing_zeros() as usize;
+                nearer &= nearer - 1;
+                // The nearest one lies on top.
+                let mut place = depth;
+                while place > first && stack[place - 1].1 < to.0[lane] {
+                    stack[place] = stack[place - 1];
+                    place -= 1;
+                }
+                stack[place] = (self.tree.wide[at].links[lane], to.0[lane]);
+                depth += 1;
+            }
+        }
+        found.hit
+    }
+}
+
+struct Found {
+    /// Squared distance.
+    best: f32,
+    hit: Option<Hit>,
+}
+
+impl Search<'_> {
+    /// Looks at one triangle, given by its place in the order of the leaves.
+    #[inline(always)]
+    fn look(&self, place: u32, found: &mut Found) {
+        let on = triangle::closest(&self.fit.corners[place as usize], self.point);
+        let distance2 = on.point.distance_squared(self.point);
+        if distance2 < found.best {
+            let triangle = self.tree.order[place as usize];
+            *found = Found { best: distance2, hit: Some(Hit { triangle, on, distance2 }) };
+        }
+    }
+
+    /// Looks at those triangles of a leaf that may be nearest, the one that seems so first.
+    #[inline(always)]
+    fn look_at_leaf(&self, leaf: usize, found: &mut Found) {
+        let to = wide::triangle_distances2(&self.fit.wide_corners[leaf], self.point);
+        let [first, count] = self.tree.leaves[leaf];
+        let to = &to.0[..count as usize];
+        let mut least = 0;
+        for lane in 1..to.len() {
+            if to[lane] < to[least] {
+                least = lane;
+            }
+        }
+        if !wide::may_be_nearer(to[least], found.best) {
+            return;
+        }
+        self.look(first + least as u32, found);
+        for (lane, to) in to.iter().enumerate() {
+            if lane != least && wide::may_be_nearer(*to, found.best) {
+                self.look(first + lane as u32, found);
+            }
+        }
+    }
+}
+
+/// Nodes of a tree over triangles whose leaves hold up to `leaf` of them, and the triangles in the order of its leaves.
+pub(crate) fn split(
+    positions: &[Vec3],
+    triangles: &[[u32; 3]],
+    leaf: usize,
+) -> (Vec<Node>, Vec<u32>) {
     let centroids: Vec<Vec3> =
         triangles.iter().map(|t| t.iter().map(|v| positions[*v as usize]).sum()).collect();
     let mut order: Vec<u32> = (0..triangles.len() as u32).collect();
     let mut nodes = Vec::new();
     if !order.is_empty() {
-        build(&mut order, 0, &centroids, &mut nodes);
+        build(&mut order, (0, leaf), &centroids, &mut nodes);
     }
     (nodes, order)
 }
 
-fn build(order: &mut [u32], first: usize, centroids: &[Vec3], nodes: &mut Vec<Node>) {
+fn build(
+    order: &mut [u32],
+    (first, leaf): (usize, usize),
+    centroids: &[Vec3],
+    nodes: &mut Vec<Node>,
+) {
     let me = nodes.len();
-    if order.len() <= LEAF_TRIANGLES {
+    if order.len() <= leaf {
         nodes.push(Node { link: first as u32, count: order.len() as u32 });
         return;
     }
@@ -199,13 +318,9 @@ fn build(order: &mut [u32], first: usize, centroids: &[Vec3], nodes: &mut Vec<No
     let middle = order.len() / 2;
     order.select_nth_unstable_by(middle, |a, b| at(a)[axis].total_cmp(&at(b)[axis]).then(a.cmp(b)));
     let (left, right) = order.split_at_mut(middle);
-    build(left, first, centroids, nodes);
+    build(left, (first, leaf), centroids, nodes);
     nodes[me].link = nodes.len() as u32;
-    build(right, first + middle, centroids, nodes);
-}
-
-fn box_distance2(bounds: &[Vec3A; 2], point: Vec3A) -> f32 {
-    point.distance_squared(point.clamp(bounds[0], bounds[1]))
+    build(right, (first + middle, leaf), centroids, nodes);
 }
 
 fn ray_meets(bounds: &[Vec3A; 2], from: Vec3A, ray: Vec3A) -> bool {

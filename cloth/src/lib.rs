@@ -31,6 +31,7 @@ pub mod solver;
 pub mod surface;
 mod tree;
 pub mod triangle;
+mod wide;
 
 pub use body::{Body, Pose, Skeleton};
 pub use crossings::{Crossing, Crossings, crossings};

@@ -8,8 +8,11 @@ use glam::{Vec3, Vec3A};
 
 use crate::bvh::{self, Node};
 use crate::mesh::Mesh;
+use crate::solver::simd::{self, Set};
 
 const NONE: u32 = u32::MAX;
+/// Most triangles of a leaf.
+const LEAF_TRIANGLES: usize = 4;
 /// Largest patch that counts as smooth as a whole: too small for its outline to meet itself.
 const PATCH_TRIANGLES: u32 = 32;
 /// In a patch that counts as smooth as a whole, the way within it between two vertices is at most
@@ -52,6 +55,8 @@ pub(crate) struct Tree {
 pub(crate) struct Fit {
     nodes: Vec<Bounds>,
     slots: Vec<Bounds>,
+    /// The slots of each node that is a leaf, side by side.
+    leaves: Vec<Leaf>,
     /// Unit normals at the beginning and at the end; zero where a triangle has none.
     pub(crate) normals: Vec<[Vec3A; 2]>,
     /// For each vertex the sum of the normals around it, and whether they all lie near that.
@@ -70,6 +75,39 @@ struct Bounds {
     high: Vec3A,
     way_low: Vec3A,
     way_high: Vec3A,
+}
+
+/// The bounds of a leaf's slots: x, y, z of `low`, `high`, `way_low` and `way_high`.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Leaf(pub(crate) [[f32; LEAF_TRIANGLES]; 12]);
+
+impl Leaf {
+    fn of(bounds: &[Bounds]) -> Self {
+        let mut leaf = Self::default();
+        for (lane, b) in bounds.iter().enumerate() {
+            for (part, v) in [b.low, b.high, b.way_low, b.way_high].into_iter().enumerate() {
+                (0..3).for_each(|k| leaf.0[3 * part + k][lane] = v[k]);
+            }
+        }
+        leaf
+    }
+
+    fn bounds(&self, lane: usize) -> Bounds {
+        let part = |p: usize| Vec3A::from_array(std::array::from_fn(|k| self.0[3 * p + k][lane]));
+        Bounds { low: part(0), high: part(1), way_low: part(2), way_high: part(3) }
+    }
+
+    /// Bit `4 i + j`: whether this leaf's slot i meets the other one's slot j.
+    pub(crate) fn meets(&self, other: &Self, reach: f32) -> u32 {
+        let mut bits = 0;
+        for i in 0..LEAF_TRIANGLES {
+            for j in 0..LEAF_TRIANGLES {
+                let near = self.bounds(i).meets(&other.bounds(j), Vec3A::splat(reach));
+                bits |= u32::from(near) << (LEAF_TRIANGLES * i + j);
+            }
+        }
+        bits
+    }
 }
 
 impl Bounds {
@@ -103,7 +141,7 @@ impl Bounds {
 impl Tree {
     /// The tree of a mesh, split by its rest shape.
     pub(crate) fn new(mesh: &Mesh) -> Self {
-        let (nodes, order) = bvh::split(mesh.rest_positions(), mesh.triangles());
+        let (nodes, order) = bvh::split(mesh.rest_positions(), mesh.triangles(), LEAF_TRIANGLES);
         let corners: Vec<[u32; 3]> = order.iter().map(|t| mesh.triangles()[*t as usize]).collect();
         let mut tree = Self {
             across: across(mesh, &corners),
@@ -244,6 +282,7 @@ impl Tree {
         }
         self.fit_fans(fit);
         fit.nodes.resize(self.nodes.len(), Bounds::default());
+        fit.leaves.resize(self.nodes.len(), Leaf::default());
         fit.axes.resize(self.nodes.len(), Vec3A::ZERO);
         for i in (0..self.nodes.len()).rev() {
             let node = self.nodes[i];
@@ -255,6 +294,7 @@ impl Tree {
                 let slots = node.link as usize..(node.link + node.count) as usize;
                 let leaf = &fit.slots[slots.clone()];
                 fit.nodes[i] = leaf[1..].iter().fold(leaf[0], |sum, b| sum.with(b));
+                fit.leaves[i] = Leaf::of(leaf);
                 fit.axes[i] = fit.normals[slots].iter().map(|[n, m]| *n + *m).sum();
             }
         }
@@ -317,7 +357,7 @@ impl Tree {
         smooth: bool,
         mut met: impl FnMut(&Fit, u32, u32),
     ) {
-        let reach = Vec3A::splat(reach);
+        let (set, reach) = (Set::detect(), Vec3A::splat(reach));
         let mut stack = std::mem::take(&mut fit.stack);
         stack.clear();
         stack.push([0, 0]);
@@ -328,7 +368,9 @@ impl Tree {
             }
             let (na, nb) = (self.nodes[a as usize], self.nodes[b as usize]);
             if na.count > 0 && nb.count > 0 {
-                self.leaves(fit, [na, nb], (reach, smooth), &mut met);
+                let near =
+                    simd::meets(set, &fit.leaves[a as usize], &fit.leaves[b as usize], reach.x);
+                self.leaves(fit, [na, nb], (near, smooth), &mut met);
                 continue;
             }
             if a == b {
@@ -357,16 +399,17 @@ impl Tree {
         &self,
         fit: &Fit,
         [a, b]: [Node; 2],
-        (reach, smooth): (Vec3A, bool),
+        (mut near, smooth): (u32, bool),
         met: &mut impl FnMut(&Fit, u32, u32),
     ) {
-        for i in a.link..a.link + a.count {
-            let first = if a.link == b.link { i + 1 } else { b.link };
-            for j in first..b.link + b.count {
-                let near = fit.slots[i as usize].meets(&fit.slots[j as usize], reach);
-                if near && !(smooth && self.is_fan(fit, i as usize, j as usize)) {
-                    met(fit, i, j);
-                }
+        while near != 0 {
+            let bit = near.trailing_zeros();
+            near &= near - 1;
+            let (i, j) = (bit / LEAF_TRIANGLES as u32, bit % LEAF_TRIANGLES as u32);
+            let known = i < a.count && j < b.count && (a.link != b.link || i < j);
+            let (i, j) = (a.link + i, b.link + j);
+            if known && !(smooth && self.is_fan(fit, i as usize, j as usize)) {
+                met(fit, i, j);
             }
         }
     }

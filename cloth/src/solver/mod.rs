@@ -43,7 +43,7 @@ const SLACK_M: f32 = 1e-5;
 pub const SPEED_MAX_M_S: f32 = 40.0;
 
 /// The first pass only has to find where the second is to be linearised.
-const FIRST: Stop = Stop { tolerance: 2e-2, iterations: 40 };
+const FIRST: Stop = Stop { tolerance: 1e-1, iterations: 40 };
 const SECOND: Stop = Stop { tolerance: 2e-3, iterations: 80 };
 
 /// What happens during a step.
@@ -133,8 +133,8 @@ pub fn step(
     ws.begin(model, state);
     let way = ws.body_way(model, span);
     let base = ((span.seconds / SUBSTEP_S_MAX) - 1e-3).ceil().max(1.0) as u32;
-    let finer = ((way / (BODY_WAY_M * base as f32)).ceil().max(1.0) as u32).next_power_of_two();
-    let substeps = base * finer.min(8) * span.refine.max(1);
+    let asked = (way / BODY_WAY_M).ceil() as u32;
+    let substeps = asked.clamp(base, 8 * base) * span.refine.max(1);
     let dt = span.seconds / substeps as f32;
     let body_way = way / substeps as f32;
     ws.find_all(model, dt, body_way);

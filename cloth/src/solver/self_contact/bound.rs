@@ -14,7 +14,7 @@ const ROUNDS: u32 = 24;
 /// Times the pairs are listed again because something moved further than foreseen.
 const LISTINGS: u32 = 4;
 /// Share of the way that lets pairs be listed again from which a vertex's pairs are among them.
-const LITTLE: f32 = 0.2;
+const LITTLE: f32 = 0.5;
 /// What a push asks for, against what must be kept.
 const GENEROUS: f32 = 2.0;
 

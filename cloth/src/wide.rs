@@ -1,0 +1,235 @@
+//! Eight boxes or triangles side by side: distances of a point to all of them at once.
+//!
+//! Safe loops over lanes, which [`crate::solver::simd`] compiles for each instruction set; every
+//! lane does the same operations in the same order, so all give the same bits.
+
+use std::ops::{Add, Div, Mul, Sub};
+
+use glam::Vec3A;
+
+/// How many lie side by side.
+pub(crate) const WIDE: usize = 8;
+/// What lanes hold that nothing was set in: far from everything (m).
+const FAR_M: f32 = 1e15;
+/// How much nearer a triangle may be than its lane says: a share of the squared distance, and m^2.
+const DOUBT: (f32, f32) = (1e-3, 1e-8);
+/// A triangle whose squared area is less than this share of that of its sides' square has no
+/// inside worth a look.
+const SLIVER: f32 = 1e-6;
+
+/// A number for each lane. Each operation is a loop of its own over the lanes, which compilers
+/// turn into one instruction.
+#[derive(Debug, Clone, Copy)]
+#[repr(align(32))]
+pub(crate) struct Lanes(pub(crate) [f32; WIDE]);
+
+/// Boxes: x, y, z of the low corners, then of the high ones (m).
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Boxes([Lanes; 6]);
+
+/// Triangles: x, y, z of the first corners, the second and the third ones (m).
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Corners([Lanes; 9]);
+
+/// A vector for each lane.
+type Vectors = [Lanes; 3];
+
+impl Lanes {
+    /// The same for all.
+    #[inline(always)]
+    pub(crate) const fn splat(value: f32) -> Self {
+        Self([value; WIDE])
+    }
+
+    #[inline(always)]
+    fn with(self, other: Self, op: impl Fn(f32, f32) -> f32) -> Self {
+        Self(std::array::from_fn(|lane| op(self.0[lane], other.0[lane])))
+    }
+
+    /// The larger one, by one instruction, as `f32::max` is not: `other`'s where one is no number.
+    #[inline(always)]
+    pub(crate) fn max(self, other: Self) -> Self {
+        self.with(other, |a, b| if a > b { a } else { b })
+    }
+
+    /// The other way.
+    #[inline(always)]
+    pub(crate) fn min(self, other: Self) -> Self {
+        self.with(other, |a, b| if a < b { a } else { b })
+    }
+
+    /// Bit by bit the lanes that are less than `value`.
+    #[inline(always)]
+    pub(crate) fn below(self, value: f32) -> u32 {
+        let mut bits = 0;
+        for (lane, own) in self.0.iter().enumerate() {
+            bits |= u32::from(*own < value) << lane;
+        }
+        bits
+    }
+}
+
+impl Add for Lanes {
+    type Output = Self;
+
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        self.with(other, |a, b| a + b)
+    }
+}
+
+impl Sub for Lanes {
+    type Output = Self;
+
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        self.with(other, |a, b| a - b)
+    }
+}
+
+impl Mul for Lanes {
+    type Output = Self;
+
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        self.with(other, |a, b| a * b)
+    }
+}
+
+impl Div for Lanes {
+    type Output = Self;
+
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        self.with(other, |a, b| a / b)
+    }
+}
+
+impl Boxes {
+    /// No box at all.
+    pub(crate) const NOWHERE: Self = Self([Lanes::splat(FAR_M); 6]);
+
+    /// Sets one box, by its low and its high corner.
+    pub(crate) fn set(&mut self, lane: usize, [low, high]: &[Vec3A; 2]) {
+        for k in 0..3 {
+            self.0[k].0[lane] = low[k];
+            self.0[3 + k].0[lane] = high[k];
+        }
+    }
+}
+
+impl Corners {
+    /// No triangle at all.
+    pub(crate) const NOWHERE: Self = Self([Lanes::splat(FAR_M); 9]);
+
+    /// Sets one triangle.
+    pub(crate) fn set(&mut self, lane: usize, corners: &[Vec3A; 3]) {
+        for (corner, at) in corners.iter().enumerate() {
+            for k in 0..3 {
+                self.0[3 * corner + k].0[lane] = at[k];
+            }
+        }
+    }
+}
+
+/// Squared distances of `point` to the boxes (m^2); 0 inside.
+#[inline(always)]
+pub(crate) fn box_distances2(boxes: &Boxes, point: Vec3A) -> Lanes {
+    let b = &boxes.0;
+    let out2 = |k: usize| {
+        let at = Lanes::splat(point[k]);
+        let out = (b[k] - at).max(at - b[3 + k]).max(Lanes::splat(0.0));
+        out * out
+    };
+    out2(0) + out2(1) + out2(2)
+}
+
+/// Squared distances of `point` to the triangles (m^2), near enough to tell which of them may be
+/// nearest ([`may_be_nearer`]).
+#[inline(always)]
+pub(crate) fn triangle_distances2(corners: &Corners, point: Vec3A) -> Lanes {
+    let c = &corners.0;
+    let (a, b, c) = ([c[0], c[1], c[2]], [c[3], c[4], c[5]], [c[6], c[7], c[8]]);
+    let p = [point.x, point.y, point.z].map(Lanes::splat);
+    let (ab, ac, bc) = (minus(b, a), minus(c, a), minus(c, b));
+    let (ap, bp) = (minus(p, a), minus(p, b));
+    let (ab2, ac2, both) = (dot(ab, ab), dot(ac, ac), dot(ab, ac));
+    let (d1, d2) = (dot(ap, ab), dot(ap, ac));
+    let to_bc = to_side(bp, bc, dot(bp, bc), dot(bc, bc));
+    let to_sides = to_side(ap, ab, d1, ab2).min(to_side(ap, ac, d2, ac2)).min(to_bc);
+    let (v, w) = (ac2 * d1 - both * d2, ab2 * d2 - both * d1);
+    let normal = [
+        ab[1] * ac[2] - ab[2] * ac[1],
+        ab[2] * ac[0] - ab[0] * ac[2],
+        ab[0] * ac[1] - ab[1] * ac[0],
+    ];
+    let (height, normal2) = (dot(normal, ap), dot(normal, normal));
+    let to_plane = height * height / normal2.max(Lanes::splat(f32::MIN_POSITIVE));
+    let beyond = ab2 * ac2 - both * both - (v + w);
+    let thin = normal2 - Lanes::splat(SLIVER) * (ab2 * ac2);
+    let inside = v.min(w).min(beyond).min(thin);
+    let of = |lane: usize| if inside.0[lane] > 0.0 { to_plane.0[lane] } else { to_sides.0[lane] };
+    Lanes(std::array::from_fn(of))
+}
+
+/// Whether a triangle at about `distance2` may be nearer than `best` (m^2).
+#[inline(always)]
+pub(crate) fn may_be_nearer(distance2: f32, best: f32) -> bool {
+    distance2 < best + (best * DOUBT.0 + DOUBT.1)
+}
+
+/// Squared distance to the side `along` from its beginning's way `to` to the point.
+#[inline(always)]
+fn to_side(to: Vectors, along: Vectors, part: Lanes, whole: Lanes) -> Lanes {
+    let t = part / whole.max(Lanes::splat(f32::MIN_POSITIVE));
+    let t = t.max(Lanes::splat(0.0)).min(Lanes::splat(1.0));
+    let rest = [to[0] - along[0] * t, to[1] - along[1] * t, to[2] - along[2] * t];
+    dot(rest, rest)
+}
+
+#[inline(always)]
+fn minus(a: Vectors, b: Vectors) -> Vectors {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+#[inline(always)]
+fn dot(a: Vectors, b: Vectors) -> Lanes {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lab::shapes::Chance;
+    use crate::triangle;
+
+    #[test]
+    fn lanes_tell_the_distance_of_a_point_to_any_triangle_also_a_sliver() {
+        let mut chance = Chance::new(11);
+        for round in 0..4000 {
+            let mut by_chance = || Vec3A::from_array(std::array::from_fn(|_| chance.signed()));
+            let (a, b) = (by_chance(), by_chance());
+            let c = match round % 4 {
+                0 => a + (b - a) * 0.3 + by_chance() * 1e-5,
+                1 => a,
+                2 => a + by_chance() * 0.01,
+                _ => by_chance(),
+            };
+            let point = by_chance();
+            let mut corners = Corners::NOWHERE;
+            corners.set(round % WIDE, &[a, b, c]);
+            let found = triangle_distances2(&corners, point).0[round % WIDE];
+            let wanted = triangle::closest(&[a, b, c], point).point.distance_squared(point);
+            assert!(may_be_nearer(found, wanted + f32::EPSILON * wanted), "{found} for {wanted}");
+        }
+    }
+
+    #[test]
+    fn an_empty_lane_is_far_from_everything() {
+        let mut boxes = Boxes::NOWHERE;
+        boxes.set(3, &[Vec3A::ZERO, Vec3A::ONE]);
+        let to = box_distances2(&boxes, Vec3A::new(0.5, 0.5, 3.0)).0;
+        assert!((to[3] - 4.0).abs() < 1e-6);
+        assert!((0..WIDE).filter(|k| *k != 3).all(|k| to[k] > 1e20));
+    }
+}
