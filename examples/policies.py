@@ -6,8 +6,9 @@
 For every scene and start pose one store is initialised; players walk these clips on it, and their counts are
 left in the store. Copies of it are explored by every policy, and by greedy restricted to the clips. Prints a CSV
 row a step: scene, start, policy, frames beyond the initial ones, worst merge of the best prefix, and the 95th
-percentile and mean of merges as these players pass them (mm). Then a table: frames to bring the worst merge to
-parts of what it was, and at the end of greedy's frames what these players see.
+percentile and mean of merges as these players pass them (mm), and how many they pass in a second. Then a table:
+frames to bring the worst merge to parts of what it was, and what these players see at the end (mm; the last column
+is the sum of merges that they pass in a second of play).
 """
 
 import argparse
@@ -75,14 +76,14 @@ def explored(a, scene, start):
         store = a.out / f"{name}-{policy}"
         for ending in ["", ".work"]:
             shutil.copytree(f"{base}{ending}", f"{store}{ending}", dirs_exist_ok=True)
-        rows[policy] = [[0, first["worst_error_mm"], None, None]]
+        rows[policy] = [[0, first["worst_error_mm"], None, None, None]]
         for frames in range(a.step, a.frames + 1, a.step):
             total = first["simulated_frames"] + frames
             found = run(*explore, "--store", str(store), *more, "--frames", str(total))
             row = [found["simulated_frames"] - first["simulated_frames"], found["best_worst_error_mm"],
-                   found["visited_p95_mm"], found["visited_mean_mm"]]
+                   found["visited_p95_mm"], found["visited_mean_mm"], found["visited_merges_per_s"]]
             rows[policy].append(row)
-            print(f"{scene},{start},{policy},{row[0]},{row[1]:.2f},{row[2]:.3f},{row[3]:.4f}", flush=True)
+            print(f"{scene},{start},{policy},{row[0]},{row[1]:.2f},{row[2]:.3f},{row[3]:.4f},{row[4]:.4f}", flush=True)
         for ending in ["", ".work"]:
             shutil.rmtree(f"{store}{ending}")
     return rows
@@ -97,12 +98,12 @@ def table(rows):
     """What is compared, one line a policy."""
     worst = rows["greedy"][0][1]
     heads = [f"frames to {level * worst:.0f} mm" for level in LEVELS]
-    print("| policy | " + " | ".join(heads) + " | frames | worst | seen p95 | seen mean |")
-    print("| --- |" + " ---: |" * (len(LEVELS) + 4))
+    print("| policy | " + " | ".join(heads) + " | frames | worst | seen p95 | seen mean | seen a second |")
+    print("| --- |" + " ---: |" * (len(LEVELS) + 5))
     for policy, found in rows.items():
         cells = ["-" if (at := frames_to(found, level * worst)) is None else f"{at:,}" for level in LEVELS]
-        frames, last, p95, mean = found[-1]
-        cells += [f"{frames:,}", f"{last:.0f}", f"{p95:.0f}", f"{mean:.0f}"]
+        frames, last, p95, mean, merges = found[-1]
+        cells += [f"{frames:,}", f"{last:.0f}", f"{p95:.0f}", f"{mean:.0f}", f"{mean * merges:.0f}"]
         print(f"| {policy} | " + " | ".join(cells) + " |", flush=True)
 
 
@@ -121,7 +122,7 @@ def main():
     parser.add_argument("--toile", default="toile")
     a = parser.parse_args()
     a.out.mkdir(parents=True, exist_ok=True)
-    print("scene,start,policy,frames,best_worst_mm,visited_p95_mm,visited_mean_mm")
+    print("scene,start,policy,frames,best_worst_mm,visited_p95_mm,visited_mean_mm,merges_per_s")
     found = {}
     for scene in a.scene:
         for start in a.starts.split(","):
