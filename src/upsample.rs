@@ -267,6 +267,18 @@ fn table(r: &Report) -> String {
             x.retrained_rms_mm,
             closed.join(", ")
         );
+        let s = &x.second_half;
+        let _ = writeln!(
+            out,
+            "  its second half: harmonic {:.2} mm, learnt again from the first half {:.2}, from both {:.2}; \
+             sparse {:.2}, {:.2}, {:.2}",
+            s.harmonic_rms_mm,
+            s.harmonic_retrained_rms_mm,
+            s.harmonic_both_rms_mm,
+            s.sparse_rms_mm,
+            s.sparse_retrained_rms_mm,
+            s.sparse_both_rms_mm
+        );
     }
     out
 }

@@ -2,12 +2,13 @@
 
 use std::sync::Arc;
 
-use protocol::{EdgeId, PoseId};
+use protocol::{EdgeId, PoseId, StateId};
 
 use super::{Character, Shown, StepOutcome};
 use crate::free::probe::{CANDIDATES, Found, Planes};
 use crate::free::run::{Run, Way};
 use crate::free::{FORCE_MAX, Forces, Outside, PUSHES_MAX, Push};
+use crate::placement::Placement;
 use crate::version::View;
 use cloth::Vec3;
 
@@ -16,6 +17,17 @@ use cloth::Vec3;
 const FRAMES_MIN: u32 = crate::blend::BLEND_FRAMES as u32;
 /// Nearer than this (m) cloth is close to a state whatever the version's merges are like.
 const CLOSE_M: f32 = 0.01;
+/// Cloth is drawn on to the state that it is drawn to unless another is nearer than this share.
+const NEARER: f32 = 0.8;
+
+/// A state that is near the cloth outside.
+#[derive(Debug, Clone, Copy)]
+struct Nearest {
+    state: StateId,
+    /// Largest distance of a probed vertex (m), and that of the cursor's state, where it counts.
+    distance_m: f32,
+    own_m: Option<f32>,
+}
 
 /// What a character needs to leave the graph and to come back.
 #[derive(Debug)]
@@ -27,6 +39,10 @@ pub(super) struct Free {
     /// How close a state must be (m); `None`: as close as the version's merges are in the mean.
     return_within_m: Option<f32>,
     nearest_m: Option<f32>,
+    /// Whether the cursor is at the state that cloth is drawn to; and whether it came there along a
+    /// link, not as another state that is nearer.
+    aims: bool,
+    follows: bool,
     /// Which candidates are compared next.
     turn: usize,
     found: Found,
@@ -43,6 +59,8 @@ impl Default for Free {
             leave_above_m: f32::INFINITY,
             return_within_m: None,
             nearest_m: None,
+            aims: false,
+            follows: false,
             turn: 0,
             found: Found::default(),
             planes: Planes::default(),
@@ -55,8 +73,8 @@ impl Default for Free {
 /// # Forces that the graph does not know
 ///
 /// A garment whose version has an upsampler can leave the graph: cloth then goes on from where it is
-/// by a coarse simulation and the upsampler, and comes back to the nearest resident state of the pose
-/// once it is close. Frames outside count as substituted. Without an upsampler forces do nothing.
+/// by a coarse simulation and the upsampler. Once no force acts it is drawn towards the nearest
+/// resident state of the pose, gently at first, and comes back to it when it is close. Frames outside count as substituted. Without an upsampler forces do nothing.
 impl Character {
     /// Whether this version's upsampler is here, so that forces have an effect.
     pub fn can_leave(&self) -> bool {
@@ -95,7 +113,8 @@ impl Character {
     }
 
     /// How close (m, the largest distance of any vertex) a state must be for coming back; `None`, as
-    /// at first: as close as the version's merges are in the mean, for these are blended all the time.
+    /// at first: as close as the version's merges are in the mean, for these are blended all the time,
+    /// or as the upsampler comes to the states that it was learned from.
     pub fn return_within(&mut self, distance_m: Option<f32>) {
         self.free.return_within_m = distance_m;
     }
@@ -138,7 +157,7 @@ impl Character {
         let velocities = self.now.len() == self.before.len() && !self.just_renewed;
         if both && run.start(&upsampled, &way, velocities) {
             self.stats.left += 1;
-            self.free.nearest_m = None;
+            (self.free.nearest_m, self.free.aims) = (None, false);
         }
         self.free.run = run;
     }
@@ -181,7 +200,8 @@ impl Character {
             return StepOutcome::Missed;
         }
         let from = self.placement;
-        self.follow_links(&view, edge, next_pose);
+        self.free.follows &= self.follow_links(&view, edge, next_pose);
+        self.aim(&view, &from);
         let way = Way { scene, from: &from, to: &self.placement };
         if !self.free.run.step(&way, &mut self.free.forces) {
             // Nothing that can be simulated: on in the graph.
@@ -194,7 +214,7 @@ impl Character {
         if !self.free.forces.act() && self.free.run.frames >= FRAMES_MIN {
             self.come_back(&view);
         } else {
-            self.free.nearest_m = None;
+            (self.free.nearest_m, self.free.aims) = (None, false);
         }
         StepOutcome::Substituted { error_m }
     }
@@ -204,8 +224,22 @@ impl Character {
         self.batch.jumps += 1;
     }
 
-    /// The cursor goes where the links lead, so that regions are fetched as ever.
-    fn follow_links(&mut self, view: &View, edge: Option<EdgeId>, next_pose: PoseId) {
+    /// Draws the cloth towards the cursor's state, where that was found near and is resident.
+    fn aim(&mut self, view: &View, from: &Placement) {
+        let (free, scratch) = (&mut self.free, &mut self.scratch);
+        let here = free.aims && !free.forces.act() && view.version.is_interior(self.state);
+        let probes = view.probes.as_ref();
+        let probes = probes.filter(|_| here && view.resident.read(self.state, &mut scratch.state));
+        let Some(probes) = probes else { return free.run.draw.stop() };
+        let scene = view.version.scene();
+        let way = [&from.hips(scene), &self.placement.hips(scene)];
+        free.run.draw.towards(probes, &scratch.state, way, free.follows);
+        free.follows = true;
+    }
+
+    /// The cursor goes where the links lead, so that regions are fetched as ever; `true` where no
+    /// merge lies between.
+    fn follow_links(&mut self, view: &View, edge: Option<EdgeId>, next_pose: PoseId) -> bool {
         let (scene, links) = (view.version.scene(), view.version.links());
         let follow = edge.and_then(|edge| links.follow(self.state, scene.slot(edge)));
         match edge {
@@ -216,44 +250,69 @@ impl Character {
             }
         }
         let any = || links.interior(next_pose).first().copied();
-        if let Some(state) = follow.map(|follow| follow.state).or_else(any) {
+        let state = follow.as_ref().map(|follow| follow.state);
+        if let Some(state) = state.or_else(any) {
             self.state = state;
         }
+        follow.is_some_and(|follow| follow.via.is_none())
     }
 
-    /// Goes back to the nearest resident state of the pose and the class, if one is close.
+    /// Goes back to the nearest resident state of the pose and the class, if one is close; otherwise
+    /// the cursor goes there, and the cloth is drawn to it.
     fn come_back(&mut self, view: &View) {
-        let Some((state, _)) = self.nearest(view) else { return };
+        let Some(Nearest { state, distance_m, own_m }) = self.nearest(view) else {
+            self.free.aims = false;
+            return;
+        };
+        // A few vertices tell that it is not close; all of them tell that it is.
+        self.free.nearest_m = Some(distance_m);
+        if distance_m <= self.close_m(view) && self.enter_state(view, state) {
+            return;
+        }
+        let stays = self.free.aims && own_m.is_some_and(|own_m| NEARER * own_m <= distance_m);
+        if !stays {
+            (self.state, self.free.follows) = (state, false);
+        }
+        self.free.aims = true;
+    }
+
+    /// Goes back to a state, if that is close at all vertices.
+    fn enter_state(&mut self, view: &View, state: StateId) -> bool {
         let mut scratch = std::mem::take(&mut self.scratch);
         view.resident.read(state, &mut scratch.best);
         let basis = view.version.basis();
         let (rows, columns) = (basis.rows(), basis.columns().min(scratch.best.len()));
         let made = basis.reconstruct(&scratch.best, 0..rows, columns, &mut scratch.positions);
+        let mut enters = false;
         if made.is_ok() && self.free.run.now.len() == rows {
             self.overlay.now.clear();
             view.resident.fixes(state, &mut self.overlay.now);
             let error_m = self.overlay.offset_m(&self.free.run.now, &mut scratch.positions);
             self.free.nearest_m = Some(error_m);
-            if error_m <= self.close_m(view) {
+            enters = error_m <= self.close_m(view);
+            if enters {
                 self.overlay.carry_offset(&scratch.positions);
                 self.blend.clear();
                 self.blend.add_error(error_m);
                 self.base.copy_from_slice(&scratch.best);
                 (self.state, self.shown_by) = (state, Shown::Named);
                 self.free.run.upsampled = None;
+                self.free.aims = false;
                 self.stats.entered += 1;
             }
         }
         self.scratch = scratch;
+        enters
     }
 
     fn close_m(&self, view: &View) -> f32 {
         let mean = view.version.listing().stats.mean_error_m;
-        self.free.return_within_m.unwrap_or(mean.max(CLOSE_M))
+        let learned = self.free.run.upsampled.as_ref().map_or(0.0, |u| u.upsampler().parts().max_m);
+        self.free.return_within_m.unwrap_or(mean.max(learned).max(CLOSE_M))
     }
 
-    /// Of the candidates whose turn it is, the nearest by probed vertices, and its distance (m).
-    fn nearest(&mut self, view: &View) -> Option<(protocol::StateId, f32)> {
+    /// Of the candidates whose turn it is, the nearest by probed vertices.
+    fn nearest(&mut self, view: &View) -> Option<Nearest> {
         let (probes, upsampled) = (view.probes.as_ref()?, self.free.run.upsampled.clone()?);
         let scene = view.version.scene();
         let free = &mut self.free;
@@ -265,7 +324,7 @@ impl Character {
         let interior = view.version.links().interior(self.placement.pose());
         let first = if interior.len() > CANDIDATES { free.turn } else { 0 };
         free.turn = free.turn.wrapping_add(CANDIDATES);
-        let mut best: Option<(protocol::StateId, f32)> = None;
+        let mut best: Option<Nearest> = None;
         // The state that the links name is looked at in any case.
         let turns =
             (0..interior.len().min(CANDIDATES)).map(|i| interior[(first + i) % interior.len()]);
@@ -275,11 +334,13 @@ impl Character {
             {
                 continue;
             }
-            let most = best.map_or(f32::INFINITY, |(_, distance_m)| distance_m);
+            let most = best.map_or(f32::INFINITY, |best| best.distance_m);
             let found = &free.found;
             let distance = probes.distance_m(&self.scratch.state, &free.planes, found, most);
             if let Some(distance_m) = distance {
-                best = Some((state, distance_m));
+                let own_m = if state == self.state { Some(distance_m) } else { None };
+                let own_m = own_m.or(best.and_then(|best| best.own_m));
+                best = Some(Nearest { state, distance_m, own_m });
             }
         }
         best

@@ -1,6 +1,6 @@
 //! The way back: how far a state of the graph is from the cloth outside, by a few vertices.
 //!
-//! Positions are linear in coefficients, so a few rows of the basis, laid out once, give a state's
+//! Positions are linear in coefficients, and so are coarse points, to which cloth is drawn. So a few rows of the basis, laid out once, give a state's
 //! probed vertices without reconstructing it. Classes (hood up, hood down) are told in the same
 //! way, from the mean rows of their regions.
 
@@ -24,6 +24,8 @@ pub struct Probes {
     /// Three rows for each probed vertex, then for each class; `columns` numbers each (m at full
     /// scale).
     rows: Vec<f32>,
+    /// Three rows for each coarse point, likewise.
+    coarse: Vec<f32>,
 }
 
 /// Scratch of a search: probed places (m) of the cloth and of a candidate, and the cloth's classes.
@@ -43,12 +45,19 @@ impl Probes {
         let classes = &upsampler.parts().classes;
         let count = 3 * (vertices.len() + classes.len());
         let mut rows = vec![0.0; count * columns];
+        let points = 3 * upsampler.coarse();
+        let (mut coarse, mut restricted) = (vec![0.0; points * columns], vec![0.0; points]);
         let (mut unit, mut all) = (vec![0.0; columns], vec![0.0; basis.rows()]);
         let means: Vec<&[u32]> = classes.iter().map(|class| &class.vertices[..]).collect();
         for column in 0..columns {
             unit[column] = 1.0;
             let fits = basis.reconstruct(&unit, 0..basis.rows(), columns, &mut all);
             debug_assert!(fits.is_ok(), "made to measure");
+            let fits = upsampler.restrict(&all, &mut restricted);
+            debug_assert!(fits.is_ok(), "made to measure");
+            for (row, x) in restricted.iter().enumerate() {
+                coarse[row * columns + column] = *x;
+            }
             unit[column] = 0.0;
             let single = vertices.iter().map(std::slice::from_ref);
             for (index, of) in single.chain(means.iter().copied()).enumerate() {
@@ -58,7 +67,15 @@ impl Probes {
                 }
             }
         }
-        Self { vertices, columns, rows }
+        Self { vertices, columns, rows, coarse }
+    }
+
+    /// Coarse points (m, in the state frame) of the state with these coefficients.
+    pub(crate) fn coarse_m(&self, coefficients: &[f32], out: &mut Vec<f32>) {
+        let known = self.columns.min(coefficients.len());
+        let of = |row: &[f32]| dot(&row[..known], &coefficients[..known]);
+        out.clear();
+        out.extend(self.coarse.chunks_exact(self.columns.max(1)).map(of));
     }
 
     /// Prepares the comparison with cloth whose rows (m) are given, in the state frame at `hips`.

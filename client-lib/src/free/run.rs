@@ -6,6 +6,7 @@ use cloth::coarse::{Input, Moving};
 use cloth::{Pose, Rigid, State, Vec3};
 use codec::upsample::{Drive, Transform};
 
+use super::draw::Draw;
 use super::{Forces, Upsampled, transform};
 use crate::blend::BLEND_FRAMES;
 use crate::placement::Placement;
@@ -28,6 +29,8 @@ pub(crate) struct Run {
     residual: Vec<f32>,
     /// Coarse cloth in the world.
     state: State,
+    /// What leads it back to the graph.
+    pub(crate) draw: Draw,
     scratch: Scratch,
 }
 
@@ -120,6 +123,7 @@ impl Run {
         self.now.copy_from_slice(&self.before);
         self.upsampled = Some(Arc::clone(upsampled));
         self.frames = 0;
+        self.draw.stop();
         self.shows_now = true;
         true
     }
@@ -185,10 +189,17 @@ impl Run {
         s.pushes.clear();
         if !forces.pushes.is_empty() {
             s.pushes.extend(self.state.positions.iter().map(|x| forces.acceleration(*x)));
+        } else if self.draw.is_on() {
+            s.pushes.resize(self.state.positions.len(), Vec3::ZERO);
+            let begun = f32::from(step - 1) / f32::from(steps);
+            let frame_s = seconds * f32::from(steps);
+            let State { positions, velocities } = &self.state;
+            self.draw.add((positions, velocities), begun, (frame_s, seconds), &mut s.pushes);
+            self.draw.pass(seconds);
         }
         let input = Input {
             pins: &s.pins,
-            colliders: &s.capsules,
+            colliders: if self.draw.passes_body() { &[] } else { &s.capsules },
             wind: forces.wind,
             push: &s.pushes,
             seconds,

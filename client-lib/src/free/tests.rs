@@ -198,8 +198,9 @@ fn where_nothing_is_close_it_stays_outside_and_says_so() {
 
 #[test]
 fn it_comes_back_within_its_class_only() {
-    // The cloth creeps back from in front of the hips; states 0 and 1 hang 14 and 11 mm behind.
-    for (threshold_m, comes_back) in [(0.5, true), (-0.5, true), (-0.006, false)] {
+    // By itself the cloth would creep for ten seconds; states 0 and 1 hang 14 and 11 mm behind, and
+    // from the tenth frame on the cloth is in front of the last plane.
+    for (threshold_m, comes_back) in [(0.5, true), (-0.5, true), (-0.0108, false)] {
         let mut stored = sheet::stored();
         stored.stepping.damping_per_s = 40.0;
         stored.classes = vec![codec::upsample::Class { threshold_m, ..sheet::class() }];
@@ -207,7 +208,7 @@ fn it_comes_back_within_its_class_only() {
         let at = play.character.placement().translation - Vec3::Y * 0.4;
         let acceleration = Vec3::new(0.0, 0.0, 60.0);
         assert!(play.character.push(Push { at, radius_m: 0.5, acceleration, frames: 5 }));
-        let back = (0..300).any(|_| play.step() == StepOutcome::Exact);
+        let back = (0..60).any(|_| play.step() == StepOutcome::Exact);
         assert_eq!(back, comes_back, "{threshold_m}: {:?}", play.character.outside());
     }
 }

@@ -66,11 +66,11 @@ pub(crate) struct Matrix {
 pub(crate) struct Scratch {
     /// Before solving the right-hand side, after it the residual.
     pub(crate) residual: Vec<Vec3A>,
-    inverse: Vec<Mat3A>,
-    z: Vec<Vec3A>,
-    p: Vec<Vec3A>,
+    pub(crate) inverse: Vec<Mat3A>,
+    pub(crate) z: Vec<Vec3A>,
+    pub(crate) p: Vec<Vec3A>,
     pub(crate) coarse: CoarseLevel,
-    q: Vec<Vec3A>,
+    pub(crate) q: Vec<Vec3A>,
 }
 
 /// What a solve is told besides the matrix.

@@ -13,7 +13,7 @@
 use glam::{Mat3A, Vec3, Vec3A};
 
 use super::contact::{Friction, Kind, Row};
-use super::matrix::Stop;
+use super::matrix::{Scratch, Stop};
 use super::simd::{self, Task};
 use super::{FIRST, SPEED_MAX_M_S, Workspace, limit};
 use crate::coarse::Moving;
@@ -337,8 +337,13 @@ impl Workspace {
     fn solve_tracked(&mut self, model: &Model, tracker: &Tracker, stop: Stop) -> u32 {
         let count = self.x.len();
         let diagonal = self.matrix.diagonal.iter().zip(&self.held);
-        let inverse: Vec<Mat3A> =
-            diagonal.map(|(d, held)| if *held { Mat3A::ZERO } else { d.inverse() }).collect();
+        let Scratch { residual: r, inverse, z, p, q, .. } = &mut self.scratch;
+        inverse.clear();
+        inverse.extend(diagonal.map(|(d, held)| if *held { Mat3A::ZERO } else { d.inverse() }));
+        for list in [&mut *z, &mut *p, &mut *q] {
+            list.clear();
+            list.resize(count, Vec3A::ZERO);
+        }
         let free = |held: &[bool], list: &mut [Vec3A]| {
             list.iter_mut()
                 .zip(held)
@@ -346,38 +351,36 @@ impl Workspace {
                 .for_each(|(v, _)| *v = Vec3A::ZERO);
         };
         let precondition = |r: &[Vec3A], z: &mut [Vec3A]| {
-            z.iter_mut().zip(r).zip(&inverse).for_each(|((z, r), inverse)| *z = *inverse * *r);
+            z.iter_mut().zip(r).zip(&*inverse).for_each(|((z, r), inverse)| *z = *inverse * *r);
             tracker.project(z, false);
             z.iter().zip(r).map(|(z, r)| *z * *r).sum::<Vec3A>().element_sum()
         };
-        let (mut q, mut z) = (vec![Vec3A::ZERO; count], vec![Vec3A::ZERO; count]);
-        self.matrix.multiply(&model.pattern, &self.dx, &mut q);
-        let r = &mut self.scratch.residual;
-        r.iter_mut().zip(&q).for_each(|(r, q)| *r -= *q);
+        self.matrix.multiply(&model.pattern, &self.dx, q);
+        r.iter_mut().zip(&*q).for_each(|(r, q)| *r -= *q);
         free(&self.held, r);
         tracker.project(r, true);
         let floor: f32 =
-            self.reference.iter().zip(&inverse).map(|(f, inverse)| f.dot(*inverse * *f)).sum();
-        let mut rz = precondition(r, &mut z);
+            self.reference.iter().zip(&*inverse).map(|(f, inverse)| f.dot(*inverse * *f)).sum();
+        let mut rz = precondition(r, z);
         let enough = stop.tolerance * stop.tolerance * rz.max(floor);
-        let mut p = z.clone();
+        p.copy_from_slice(z);
         let mut iterations = 0;
         while rz > enough && iterations < stop.iterations {
-            let curvature = self.matrix.multiply(&model.pattern, &p, &mut q);
+            let curvature = self.matrix.multiply(&model.pattern, p, q);
             if !curvature.is_normal() || curvature < 0.0 {
                 break;
             }
             let alpha = rz / curvature;
-            free(&self.held, &mut q);
+            free(&self.held, q);
             for i in 0..count {
                 self.dx[i] += p[i] * alpha;
                 r[i] -= q[i] * alpha;
             }
             tracker.project(r, true);
-            let next = precondition(r, &mut z);
+            let next = precondition(r, z);
             let beta = next / rz;
             rz = next;
-            p.iter_mut().zip(&z).for_each(|(p, z)| *p = *z + *p * beta);
+            p.iter_mut().zip(&*z).for_each(|(p, z)| *p = *z + *p * beta);
             iterations += 1;
         }
         iterations

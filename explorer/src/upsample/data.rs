@@ -70,6 +70,32 @@ impl Frames {
         }
     }
 
+    /// These frames, then others of the same meshes.
+    pub fn and(&self, other: &Self) -> Self {
+        let columns = self.fine.ncols();
+        let all = columns + other.fine.ncols();
+        let coarse = Mat::from_fn(self.coarse.nrows(), all, |i, c| {
+            if c < columns { self.coarse[(i, c)] } else { other.coarse[(i, c - columns)] }
+        });
+        let fine = Mat::from_fn(self.fine.nrows(), all, |i, c| {
+            if c < columns { self.fine[(i, c)] } else { other.fine[(i, c - columns)] }
+        });
+        let middles = self.middles.iter().chain(&other.middles).copied().collect();
+        Self { coarse, fine, points: self.points, middles }
+    }
+
+    /// These frames, then the same with each row in another's place.
+    pub fn with_rows_of(&self, coarse: &[usize], fine: &[usize]) -> Self {
+        let columns = self.fine.ncols();
+        let turned = Self {
+            coarse: Mat::from_fn(coarse.len(), columns, |i, c| self.coarse[(coarse[i], c)]),
+            fine: Mat::from_fn(fine.len(), columns, |i, c| self.fine[(fine[i], c)]),
+            points: self.points,
+            middles: self.middles.clone(),
+        };
+        self.and(&turned)
+    }
+
     /// The same frames with what `operator` (N x M) makes of the coarse points taken away.
     pub fn without(&self, operator: MatRef<'_, f32>) -> Self {
         let positions = self.coarse.subrows(0, operator.ncols());

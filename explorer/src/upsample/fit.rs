@@ -48,13 +48,13 @@ pub struct Training {
     points: usize,
     /// What every coarse point has of every row: 1/M, or 0 for what is added to an operator.
     affine: f32,
-    fine: usize,
+    pub(super) fine: usize,
     /// Z, once or (with history) twice.
-    basis: Mat<f64>,
+    pub(super) basis: Mat<f64>,
     /// N x k.
     functions: Mat<f64>,
-    weights: Vec<f64>,
-    normal: Normal,
+    pub(super) weights: Vec<f64>,
+    pub(super) normal: Normal,
     harmonic: Diagonal,
     /// What the harmonics do not span of the right-hand sides, turned like theirs.
     rest: Mat<f64>,
@@ -164,7 +164,7 @@ impl Training {
         self
     }
 
-    fn whole(&self, rows: MatRef<'_, f32>) -> Mat<f32> {
+    pub(super) fn whole(&self, rows: MatRef<'_, f32>) -> Mat<f32> {
         let mut whole = Mat::from_fn(self.fine, self.basis.nrows(), |i, j| {
             rows[(i, j)] + if j < self.points { self.affine } else { 0.0 }
         });
@@ -186,7 +186,7 @@ pub fn functions(harmonics: &Harmonics, k: usize) -> Mat<f64> {
 }
 
 /// Lower triangle of C V^-1 C, with V over its mean.
-fn squared(laplacian: &Laplacian) -> Vec<(usize, usize, f64)> {
+pub(super) fn squared(laplacian: &Laplacian) -> Vec<(usize, usize, f64)> {
     let n = laplacian.areas.len();
     let mean: f64 = laplacian.areas.iter().sum::<f64>() / n as f64;
     let mut rows: Vec<Vec<(usize, f64)>> = vec![Vec::new(); n];

@@ -9,6 +9,7 @@ use super::cached_harmonics;
 use super::data::Frames;
 use super::fit::{FitError, Profile, Training};
 use super::harmonics::{Harmonics, HarmonicsError, Laplacian, harmonics};
+use super::mirror::Mirror;
 use super::modes::{Mode, along_normals, modes};
 use super::report::{matrix, rows};
 use super::run::{RunError, Simulation, clustered};
@@ -181,15 +182,21 @@ impl Lesson {
         Laplacian::new(&self.scene.fine.mesh)
     }
 
-    /// Penalty of the sparse operator, chosen on the end of the training motion.
+    /// Penalty of the sparse operator, chosen on the end of the training motion, and its sum of squares
+    /// there (m^2); with a `mirror` it learns from mirrored frames as well.
     ///
     /// # Errors
     /// A fit without a solution.
-    pub fn tune_sparse(&self, prior: MatRef<'_, f32>) -> Result<f64, FitError> {
+    pub fn tune_sparse(
+        &self,
+        prior: MatRef<'_, f32>,
+        mirror: Option<&Mirror>,
+    ) -> Result<(f64, f64), FitError> {
         let choices: Vec<f64> = (0..7).map(|i| 4f64.powi(i - 5)).collect();
         let supports = self.supports();
-        held_out(self.training(), &choices, |frames, gamma| {
-            beyond::sparse(frames, prior, &supports, gamma)
+        held_out(self.training(), &choices, |frames, gamma| match mirror {
+            Some(mirror) => beyond::sparse(&mirror.both(frames), prior, &supports, gamma),
+            None => beyond::sparse(frames, prior, &supports, gamma),
         })
     }
 

@@ -1,21 +1,25 @@
 //! Learned upsampling, off line (Kavan et al. 2011): from a coarse and a tracked fine simulation
 //! to the linear operator that lifts one to the other.
 //!
-//! Map: [`scene`] the paper's four scenes; [`figure`] the character with its capsules; [`patch`]
+//! Map: [`aggregate`] the paper's slow baseline whole; [`scene`] the paper's four scenes; [`figure`] the character with its capsules; [`patch`]
 //! coarse and fine meshes of one surface, barycentric lift and Loop subdivision; [`mod@harmonics`] the
 //! smoothest functions of a mesh; [`run`] tracked simulation; [`cache`] results in the work
 //! folder; [`data`] frames as matrices; [`fit`] the paper's operators; [`tune`] their parameters;
-//! [`modes`] oscillatory modes; [`beyond`] what the paper leaves open; [`judge`] errors; [`mod@learn`] a
+//! [`modes`] oscillatory modes; [`beyond`] what the paper leaves open; [`mirror`] frames
+//! seen in a mirror; [`judge`] errors; [`fair`] learning again, judged on frames that were not learnt from; [`mod@learn`] a
 //! scene from its name to an operator; [`stored`] U as a client holds it; [`report`] all methods side by side.
 
+pub mod aggregate;
 pub mod beyond;
 pub mod cache;
 pub mod data;
+pub mod fair;
 pub mod figure;
 pub mod fit;
 pub mod harmonics;
 pub mod judge;
 pub mod learn;
+pub mod mirror;
 pub mod modes;
 pub mod patch;
 pub mod report;

@@ -5,16 +5,19 @@ use serde::Serialize;
 
 use super::beyond::{self, Blend};
 use super::data::{Frames, narrow};
+use super::fair::SecondHalf;
 use super::fit::{Profile, Training};
 use super::judge::{Errors, Judge};
 use super::learn::{LearnError, Lesson};
+use super::mirror::Mirror;
 use super::modes::{Mode, with_modes};
 use super::patch;
 use super::stored::Rounding;
 use crate::cpu::CpuClock;
 
 /// Ways of going beyond the paper.
-const BEYOND: [&str; 4] = ["harmonic-lift", "sparse", "history", "blended"];
+const BEYOND: [&str; 6] =
+    ["harmonic-lift", "harmonic-mirrored", "sparse", "sparse-mirrored", "history", "blended"];
 
 /// What a scene came to.
 #[derive(Debug, Clone, Serialize)]
@@ -76,6 +79,10 @@ pub struct Parameters {
     pub harmonic_lift: [f64; 3],
     /// gamma of the sparse operator.
     pub sparse: f64,
+    /// gamma of the one that learns from mirrored frames as well; `None` where the cloth has no mirror.
+    pub sparse_mirrored: Option<f64>,
+    /// Whether that one does better on the end of the training motion, which neither has learnt from.
+    pub mirror_chosen: bool,
 }
 
 /// Errors on one motion.
@@ -113,6 +120,8 @@ pub struct Retraining {
     pub harmonic_rms_mm: f64,
     /// Of one learnt from this motion with the same profile, on the frames that it was learnt from (mm).
     pub retrained_rms_mm: f64,
+    /// Both learnt from other frames than they are judged on.
+    pub second_half: SecondHalf,
     /// For each way of going beyond the paper, learnt from the training motion alone, the share of
     /// the gap between both that it closes; over 1 where it is better than learning again.
     pub gap_closed: Vec<Closed>,
@@ -137,6 +146,15 @@ pub enum Method {
     Modes(Mat<f32>, Vec<Mode>),
     /// Matrices blended by state.
     Blended(Blend),
+}
+
+/// What was learnt with a mirror.
+struct Mirrored {
+    harmonic: Mat<f32>,
+    sparse: Mat<f32>,
+    gamma: f64,
+    /// Sum of squares of the sparse one on the end of the training motion (m^2).
+    held_out: f64,
 }
 
 /// All methods of a scene.
@@ -186,20 +204,23 @@ impl Lesson {
         let corrected = beyond::corrected(frames, prior.as_ref(), harmonics, k, &lift_profile)?;
         let history =
             beyond::corrected(&frames.with_history(), prior.as_ref(), harmonics, k, &lift_profile)?;
-        let gamma = self.tune_sparse(prior.as_ref())?;
+        let (gamma, plain) = self.tune_sparse(prior.as_ref(), None)?;
         let sparse = beyond::sparse(frames, prior.as_ref(), &self.supports(), gamma)?;
         let both = (prior.as_ref(), 3);
         let blend =
             Blend::learn(frames, &self.scene.coarse.mesh, both, (harmonics, k), &lift_profile)?;
         let modes = self.modes(&harmonic);
+        let mirrored = self.mirrored(prior.as_ref(), &profile)?;
         let parameters = Parameters {
             tikhonov: alpha,
             laplacian: stiff,
             harmonic: [profile.first, profile.last, profile.exponent],
             harmonic_lift: [lift_profile.first, lift_profile.last, lift_profile.exponent],
             sparse: gamma,
+            sparse_mirrored: mirrored.as_ref().map(|m| m.gamma),
+            mirror_chosen: mirrored.as_ref().is_some_and(|m| m.held_out < plain),
         };
-        let methods = vec![
+        let mut methods = vec![
             ("barycentric", Method::Linear(prior)),
             ("loop", Method::Linear(self.subdivision())),
             ("none", Method::Linear(training.tikhonov(0.0)?)),
@@ -212,7 +233,25 @@ impl Lesson {
             ("history", Method::History(history)),
             ("blended", Method::Blended(blend)),
         ];
+        if let Some(Mirrored { harmonic, sparse, .. }) = mirrored {
+            methods.push(("harmonic-mirrored", Method::Linear(harmonic)));
+            methods.push(("sparse-mirrored", Method::Linear(sparse)));
+        }
         Ok(Methods { all: methods, parameters, seconds: [learnt + refit, refit] })
+    }
+
+    /// Operators that learn from mirrored frames as well, where the cloth has a mirror.
+    fn mirrored(
+        &self,
+        prior: MatRef<'_, f32>,
+        profile: &Profile,
+    ) -> Result<Option<Mirrored>, LearnError> {
+        let Some(mirror) = Mirror::of(&self.scene) else { return Ok(None) };
+        let (gamma, held_out) = self.tune_sparse(prior, Some(&mirror))?;
+        let both = mirror.both(self.training());
+        let sparse = beyond::sparse(&both, prior, &self.supports(), gamma)?;
+        let harmonic = Training::new(&both, &self.harmonics, self.k)?.harmonic(profile);
+        Ok(Some(Mirrored { harmonic, sparse, gamma, held_out }))
     }
 
     /// The whole report.
@@ -236,7 +275,7 @@ impl Lesson {
         let cost = self.cost(harmonic)?;
         let [first, last, exponent] = parameters.harmonic;
         let profile = Profile { first, last, exponent };
-        let motions = self.judge_all(&judge, &methods)?;
+        let (motions, gamma) = (self.judge_all(&judge, &methods)?, parameters.sparse);
         let hertz = |m: &Mode| m.theta / std::f64::consts::TAU / f64::from(self.scene.frame_s);
         Ok(Report {
             scene: self.scene.name,
@@ -258,7 +297,7 @@ impl Lesson {
             partition_of_unity: unity(harmonic.as_ref()),
             modes: modes.unwrap_or_default().iter().map(|m| [hertz(m), m.explained]).collect(),
             rounding: self.rounding(harmonic)?,
-            retraining: self.retraining(&judge, &profile, &motions)?,
+            retraining: self.retraining(&judge, (&profile, gamma), &motions)?,
             motions,
         })
     }
@@ -292,7 +331,7 @@ impl Lesson {
     fn retraining(
         &self,
         judge: &Judge,
-        profile: &Profile,
+        (profile, gamma): (&Profile, f64),
         motions: &[MotionReport],
     ) -> Result<Vec<Retraining>, LearnError> {
         let mut out = Vec::new();
@@ -306,11 +345,13 @@ impl Lesson {
             };
             let old = rms("harmonic");
             let close = |name| Closed { name, share: (old - rms(name)) / (old - new) };
+            let closed = BEYOND.map(close).into_iter().filter(|closed| closed.share.is_finite());
             out.push(Retraining {
                 motion: report.motion,
                 harmonic_rms_mm: old,
                 retrained_rms_mm: new,
-                gap_closed: BEYOND.map(close).into(),
+                second_half: self.second_half(judge, profile, gamma, frames)?,
+                gap_closed: closed.collect(),
             });
         }
         Ok(out)

@@ -180,7 +180,7 @@ fn least(values: impl Iterator<Item = f64>, price: impl Fn(f64) -> f64) -> f64 {
 }
 
 /// The best of `choices` on the last quarter of the frames, where the fit is any function of the
-/// frames before.
+/// frames before, and its sum of squares there (m^2).
 ///
 /// # Errors
 /// Of the fit.
@@ -188,7 +188,7 @@ pub fn held_out<E>(
     frames: &Frames,
     choices: &[f64],
     fit: impl Fn(&Frames, f64) -> Result<Mat<f32>, E>,
-) -> Result<f64, E> {
+) -> Result<(f64, f64), E> {
     let count = frames.count();
     let cut = count - count / BLOCKS;
     let (known, rest) = (frames.part(0, cut - MARGIN.min(cut - 1)), frames.part(cut, count));
@@ -201,5 +201,5 @@ pub fn held_out<E>(
             best = (error, *choice);
         }
     }
-    Ok(best.1)
+    Ok((best.1, best.0))
 }
