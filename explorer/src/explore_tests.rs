@@ -413,35 +413,47 @@ fn tree(root: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
 
 #[test]
 fn the_published_store_is_equal_for_any_workers_and_after_any_stop() {
-    let mut first = None;
-    for (workers, patience) in [(1, u64::MAX), (2, u64::MAX), (2, 4)] {
-        let (scene, toy) = (toy_scene(), Toy::new(150));
-        let folder = tempfile::tempdir().unwrap();
-        let root = folder.path().join("store");
-        std::fs::create_dir(&root).unwrap();
-        let summary = (0..500).find_map(|_| {
-            let place = Place {
-                store: crate::pack::local_store(&root).unwrap(),
-                folder: Some(root.clone()),
-                key: SigningKey::from_seed(&[7; 32]),
-                work: folder.path().join("work"),
-            };
-            let asked = AtomicU64::new(0);
-            let should_stop = Arc::new(move || asked.fetch_add(1, Ordering::Relaxed) >= patience);
-            let options = ExploreOptions { workers, should_stop, ..options(200) };
-            let mut quiet = |_: &Progress| {};
-            let future = super::explore(&scene, &toy, &place, &options, &mut quiet);
-            let summary = block_on(future).unwrap();
-            (summary.end == End::Frames).then_some(summary)
-        });
-        let versions = summary.expect("it gets there").version;
-        assert!(versions >= 3, "{versions}");
-        let found = tree(&root);
-        assert!(found.len() > versions as usize);
-        let expected = first.get_or_insert_with(|| found.clone());
-        assert!(expected.keys().eq(found.keys()), "{workers} workers, {patience}");
-        assert!(*expected == found, "{workers} workers, {patience}");
+    for policy in [Policy::Greedy, Policy::Visited, Policy::Predictive] {
+        let mut first = None;
+        for (workers, patience) in [(1, u64::MAX), (2, u64::MAX), (2, 4)] {
+            let found = published(policy, workers, patience);
+            let expected = first.get_or_insert_with(|| found.clone());
+            assert!(expected.keys().eq(found.keys()), "{policy}, {workers} workers, {patience}");
+            assert!(*expected == found, "{policy}, {workers} workers, {patience}");
+        }
     }
+}
+
+/// What an exploration that is stopped again and again leaves in its store.
+fn published(
+    policy: Policy,
+    workers: usize,
+    patience: u64,
+) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
+    let (scene, toy) = (toy_scene(), Toy::new(150));
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("store");
+    std::fs::create_dir(&root).unwrap();
+    let summary = (0..500).find_map(|_| {
+        let place = Place {
+            store: crate::pack::local_store(&root).unwrap(),
+            folder: Some(root.clone()),
+            key: SigningKey::from_seed(&[7; 32]),
+            work: folder.path().join("work"),
+        };
+        let asked = AtomicU64::new(0);
+        let should_stop = Arc::new(move || asked.fetch_add(1, Ordering::Relaxed) >= patience);
+        let options = ExploreOptions { workers, policy, should_stop, ..options(200) };
+        let mut quiet = |_: &Progress| {};
+        let future = super::explore(&scene, &toy, &place, &options, &mut quiet);
+        let summary = block_on(future).unwrap();
+        (summary.end == End::Frames).then_some(summary)
+    });
+    let versions = summary.expect("it gets there").version;
+    assert!(versions >= 3, "{versions}");
+    let found = tree(&root);
+    assert!(found.len() > versions as usize);
+    found
 }
 
 /// The dead end with the smallest error is tagged: it is simulated next, alone, and shown at once; a
