@@ -305,6 +305,14 @@ mod tests {
         let aggregate = training.whole(narrow((y * training.basis.transpose()).as_ref()).as_ref());
         let apart = apart(&aggregate, &training.laplacian(&laplacian, alpha).unwrap());
         assert!(apart < 1e-4, "{apart}");
+        // The same by conjugate gradients, which end where nothing is left.
+        let mut last = 1.0;
+        let iterated = training.aggregate(&laplacian, alpha, &mut |solve, _| {
+            last = solve.residual;
+            solve.iterations < 5_000
+        });
+        let apart = self::apart(&iterated, &aggregate);
+        assert!(apart < 1e-4 && last < 1e-9, "{apart}, residual {last}");
     }
 
     #[test]
