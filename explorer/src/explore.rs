@@ -328,12 +328,8 @@ async fn run(
     let mut paused = Paused::default();
     progress(&run.progress(&setup, &work, None));
     loop {
-        if !work.ledger().round().is_done() && frames_reached(&work, options) {
-            if behind {
-                let newest = work.graph().commit();
-                publish(&mut work, publisher, (newest, false)).await?;
-            }
-            return finish(&setup, work, &run, publisher, End::Frames).await;
+        if frames_reached_in_round(&work, options) {
+            return finish_round(&setup, work, &run, (publisher, behind)).await;
         }
         if work.ledger().round().is_done() {
             let ended = between_rounds(
@@ -494,11 +490,26 @@ fn due(work: &Work, every: u64) -> bool {
     }
 }
 
-/// Whether a whole graph has as many frames as were asked for.
-fn frames_reached(work: &Work, options: &ExploreOptions) -> bool {
+/// Whether a whole graph has as many frames as were asked for, in the middle of a round.
+fn frames_reached_in_round(work: &Work, options: &ExploreOptions) -> bool {
     let graph = work.graph();
-    work.ledger().phase() == Phase::Expansion
+    !work.ledger().round().is_done()
+        && work.ledger().phase() == Phase::Expansion
         && options.frames.is_some_and(|frames| graph.simulated_frames() >= frames)
+}
+
+/// Ends in the middle of a round; what is left of it is done by whoever goes on.
+async fn finish_round(
+    setup: &Setup<'_>,
+    mut work: Work,
+    run: &Run,
+    (publisher, behind): (&mut impl Publish, bool),
+) -> Result<Summary, ExploreError> {
+    if behind {
+        let newest = work.graph().commit();
+        publish(&mut work, publisher, (newest, false)).await?;
+    }
+    finish(setup, work, run, publisher, End::Frames).await
 }
 
 fn reached(graph: &Graph, options: &ExploreOptions) -> Option<End> {
