@@ -12,7 +12,7 @@ use explorer::upsample::cache::Cache;
 use explorer::upsample::fit::Profile;
 use explorer::upsample::judge::{Errors, Judge};
 use explorer::upsample::learn::{HARMONICS, Lesson, Tests};
-use explorer::upsample::report::{Method, Report};
+use explorer::upsample::report::{Method, Report, Retraining};
 use explorer::upsample::scene::NAMES;
 use picture::Plot;
 use serde::Serialize;
@@ -256,31 +256,34 @@ fn table(r: &Report) -> String {
     for [hertz, share] in &r.modes {
         let _ = writeln!(out, "modes: {hertz:.2} Hz, {:.1} % of what was left", 100.0 * share);
     }
-    for x in &r.retraining {
-        let closed: Vec<String> =
-            x.gap_closed.iter().map(|c| format!("{} {:.0} %", c.name, 100.0 * c.share)).collect();
-        let _ = writeln!(
-            out,
-            "{}: harmonic {:.2} mm, learnt again from it {:.2} mm; of that gap close: {}",
-            x.motion,
-            x.harmonic_rms_mm,
-            x.retrained_rms_mm,
-            closed.join(", ")
-        );
-        let s = &x.second_half;
-        let _ = writeln!(
-            out,
-            "  its second half: harmonic {:.2} mm, learnt again from the first half {:.2}, from both {:.2}; \
-             sparse {:.2}, {:.2}, {:.2}",
-            s.harmonic_rms_mm,
-            s.harmonic_retrained_rms_mm,
-            s.harmonic_both_rms_mm,
-            s.sparse_rms_mm,
-            s.sparse_retrained_rms_mm,
-            s.sparse_both_rms_mm
-        );
-    }
+    r.retraining.iter().for_each(|x| tell_retraining(x, &mut out));
     out
+}
+
+/// What learning again from one motion brings, in words.
+fn tell_retraining(x: &Retraining, out: &mut String) {
+    let closed: Vec<String> =
+        x.gap_closed.iter().map(|c| format!("{} {:.0} %", c.name, 100.0 * c.share)).collect();
+    let _ = writeln!(
+        out,
+        "{}: harmonic {:.2} mm, learnt again from it {:.2} mm; of that gap close: {}",
+        x.motion,
+        x.harmonic_rms_mm,
+        x.retrained_rms_mm,
+        closed.join(", ")
+    );
+    let s = &x.second_half;
+    let _ = writeln!(
+        out,
+        "  its second half: harmonic {:.2} mm, learnt again from the first half {:.2}, from both {:.2}; \
+         sparse {:.2}, {:.2}, {:.2}",
+        s.harmonic_rms_mm,
+        s.harmonic_retrained_rms_mm,
+        s.harmonic_both_rms_mm,
+        s.sparse_rms_mm,
+        s.sparse_retrained_rms_mm,
+        s.sparse_both_rms_mm
+    );
 }
 
 /// `toile chart` of a scene: every method as a point of time against error.

@@ -74,7 +74,8 @@ impl Default for Free {
 ///
 /// A garment whose version has an upsampler can leave the graph: cloth then goes on from where it is
 /// by a coarse simulation and the upsampler. Once no force acts it is drawn towards the nearest
-/// resident state of the pose, gently at first, and comes back to it when it is close. Frames outside count as substituted. Without an upsampler forces do nothing.
+/// resident state of the pose, gently at first, and comes back to it when it is close. Frames outside
+/// count as substituted. Without an upsampler forces do nothing.
 impl Character {
     /// Whether this version's upsampler is here, so that forces have an effect.
     pub fn can_leave(&self) -> bool {

@@ -2,7 +2,8 @@
 //! that no graph has seen (Kavan et al. 2011; their run time).
 //!
 //! [`Upsampled`] is made once of a version's chunk, off the frame loop; `run` steps it once a frame;
-//! [`probe`] finds the state of the graph to which it comes back, `draw` leads it there. Nothing here waits, reads or
+//! [`probe`] finds the state of the graph to which it comes back, `draw` leads it there. Nothing
+//! here waits, reads or
 //! writes, and a warm frame allocates nothing.
 
 pub(crate) mod draw;

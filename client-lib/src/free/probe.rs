@@ -1,6 +1,7 @@
 //! The way back: how far a state of the graph is from the cloth outside, by a few vertices.
 //!
-//! Positions are linear in coefficients, and so are coarse points, to which cloth is drawn. So a few rows of the basis, laid out once, give a state's
+//! Positions are linear in coefficients, and so are coarse points, to which cloth is drawn.
+//! So a few rows of the basis, laid out once, give a state's
 //! probed vertices without reconstructing it. Classes (hood up, hood down) are told in the same
 //! way, from the mean rows of their regions.
 

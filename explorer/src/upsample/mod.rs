@@ -1,12 +1,14 @@
 //! Learned upsampling, off line (Kavan et al. 2011): from a coarse and a tracked fine simulation
 //! to the linear operator that lifts one to the other.
 //!
-//! Map: [`aggregate`] the paper's slow baseline whole; [`scene`] the paper's four scenes; [`figure`] the character with its capsules; [`patch`]
+//! Map: [`aggregate`] the paper's slow baseline whole; [`scene`] the paper's four scenes;
+//! [`figure`] the character with its capsules; [`patch`]
 //! coarse and fine meshes of one surface, barycentric lift and Loop subdivision; [`mod@harmonics`] the
 //! smoothest functions of a mesh; [`run`] tracked simulation; [`cache`] results in the work
 //! folder; [`data`] frames as matrices; [`fit`] the paper's operators; [`tune`] their parameters;
 //! [`modes`] oscillatory modes; [`beyond`] what the paper leaves open; [`mirror`] frames
-//! seen in a mirror; [`judge`] errors; [`fair`] learning again, judged on frames that were not learnt from; [`mod@learn`] a
+//! seen in a mirror; [`judge`] errors; [`fair`] learning again, judged on frames that were not
+//! learnt from; [`mod@learn`] a
 //! scene from its name to an operator; [`stored`] U as a client holds it; [`report`] all methods side by side.
 
 pub mod aggregate;
