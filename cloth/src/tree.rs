@@ -4,7 +4,9 @@
 //! they do after the *relative* displacement of their contents: what moves together, as the cloth
 //! of a fast sleeve does, stays apart however far it goes.
 
-use glam::{Vec3, Vec3A};
+use std::array::from_fn;
+
+use glam::{Mat4, Vec3, Vec3A, Vec4};
 
 use crate::bvh::{self, Node};
 use crate::mesh::Mesh;
@@ -83,11 +85,14 @@ pub(crate) struct Leaf(pub(crate) [[f32; LEAF_TRIANGLES]; 12]);
 
 impl Leaf {
     fn of(bounds: &[Bounds]) -> Self {
+        // Of what is not there the first slot stands, and is not asked for.
+        let all: [&Bounds; LEAF_TRIANGLES] = from_fn(|k| bounds.get(k).unwrap_or(&bounds[0]));
         let mut leaf = Self::default();
-        for (lane, b) in bounds.iter().enumerate() {
-            for (part, v) in [b.low, b.high, b.way_low, b.way_high].into_iter().enumerate() {
-                (0..3).for_each(|k| leaf.0[3 * part + k][lane] = v[k]);
-            }
+        for (part, three) in leaf.0.chunks_exact_mut(3).enumerate() {
+            let of = |b: &Bounds| [b.low, b.high, b.way_low, b.way_high][part];
+            let [a, b, c, d] = all.map(|b| Vec4::from((of(b), 0.0)));
+            let side_by_side = Mat4::from_cols(a, b, c, d).transpose().to_cols_array_2d();
+            three.copy_from_slice(&side_by_side[..3]);
         }
         leaf
     }

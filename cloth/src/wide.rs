@@ -58,6 +58,26 @@ impl Lanes {
         self.with(other, |a, b| if a < b { a } else { b })
     }
 
+    /// The root, lane by lane.
+    #[inline(always)]
+    pub(crate) fn sqrt(self) -> Self {
+        Self(self.0.map(f32::sqrt))
+    }
+
+    /// `yes` where this is 0 or more, else `no`.
+    #[inline(always)]
+    pub(crate) fn choose(self, yes: Self, no: Self) -> Self {
+        let of = |lane: usize| if self.0[lane] >= 0.0 { yes.0[lane] } else { no.0[lane] };
+        Self(std::array::from_fn(of))
+    }
+
+    /// `yes` where this is over `value`, else `no`.
+    #[inline(always)]
+    pub(crate) fn choose_over(self, value: f32, yes: Self, no: Self) -> Self {
+        let of = |lane: usize| if self.0[lane] > value { yes.0[lane] } else { no.0[lane] };
+        Self(std::array::from_fn(of))
+    }
+
     /// Bit by bit the lanes that are less than `value`.
     #[inline(always)]
     pub(crate) fn below(self, value: f32) -> u32 {
@@ -168,8 +188,7 @@ pub(crate) fn triangle_distances2(corners: &Corners, point: Vec3A) -> Lanes {
     let beyond = ab2 * ac2 - both * both - (v + w);
     let thin = normal2 - Lanes::splat(SLIVER) * (ab2 * ac2);
     let inside = v.min(w).min(beyond).min(thin);
-    let of = |lane: usize| if inside.0[lane] > 0.0 { to_plane.0[lane] } else { to_sides.0[lane] };
-    Lanes(std::array::from_fn(of))
+    inside.choose_over(0.0, to_plane, to_sides)
 }
 
 /// Whether a triangle at about `distance2` may be nearer than `best` (m^2).
