@@ -357,8 +357,8 @@ mod tests {
         for row in (0..count).step_by(7) {
             matrix.diagonal[row].y_axis.y += 1e4;
         }
-        let mut s = Scratch::default();
-        s.residual = vec![Vec3A::new(0.1, -0.3, 0.2); count];
+        let residual = vec![Vec3A::new(0.1, -0.3, 0.2); count];
+        let mut s = Scratch { residual, ..Scratch::default() };
         if with {
             s.coarse.gather(&model.shares, pattern, &matrix_of(&matrix, &bare));
             s.coarse.factorise(&model.shares, &bare, &matrix.diagonal);

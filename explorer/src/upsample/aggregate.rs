@@ -106,7 +106,8 @@ impl Training {
             rz = next;
             solve.iterations += 1;
             solve.residual = (rz / first).sqrt();
-            let done = !(solve.residual > 1e-12);
+            // Nothing to solve for is 0 / 0.
+            let done = solve.residual <= 1e-12 || solve.residual.is_nan();
             if done || solve.iterations.is_multiple_of(50) {
                 let operator = whole(&y);
                 if !go_on(&solve, &operator) || done {
