@@ -137,7 +137,7 @@ impl Similar {
         self.kept().classes[state.index()]
     }
 
-    /// Bytes of memory that landmarks take: at most [`LANDMARK_BYTES_MAX`], about.
+    /// Bytes of memory that landmarks take: at most `LANDMARK_BYTES_MAX`, about.
     pub fn landmark_bytes(&self) -> usize {
         self.kept().pages.bytes()
     }
