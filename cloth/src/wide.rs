@@ -58,19 +58,6 @@ impl Lanes {
         self.with(other, |a, b| if a < b { a } else { b })
     }
 
-    /// The root, lane by lane.
-    #[inline(always)]
-    pub(crate) fn sqrt(self) -> Self {
-        Self(self.0.map(f32::sqrt))
-    }
-
-    /// `yes` where this is 0 or more, else `no`.
-    #[inline(always)]
-    pub(crate) fn choose(self, yes: Self, no: Self) -> Self {
-        let of = |lane: usize| if self.0[lane] >= 0.0 { yes.0[lane] } else { no.0[lane] };
-        Self(std::array::from_fn(of))
-    }
-
     /// `yes` where this is over `value`, else `no`.
     #[inline(always)]
     pub(crate) fn choose_over(self, value: f32, yes: Self, no: Self) -> Self {

@@ -11,24 +11,16 @@
 //! angle, so that it does not grow with stretch. Springs keep their tension's positive part, the
 //! shear its Gauss-Newton part.
 
-mod lanes;
-
 use glam::{Mat3A, Vec2, Vec3A};
 
-use self::lanes::{Answer, Ask, Eight};
 use super::matrix::{Matrix, Pattern};
-use super::simd;
 use crate::material::MembraneStiffness;
 use crate::mesh::Mesh;
-use crate::wide::WIDE;
 
 /// Principal strain from which a triangle stiffens.
 pub(crate) const SOFT_STRAIN: f32 = 0.05;
 /// How much stiffer than Young's modulus the limit is.
 pub(crate) const LIMIT_FACTOR: f32 = 10.0;
-
-/// Pairs of corners between which a triangle's Hessian has its blocks.
-const PAIRS: [[usize; 2]; 3] = [[0, 1], [0, 2], [1, 2]];
 
 /// Where forces and their slopes are summed.
 pub(crate) struct Sums<'a> {
@@ -64,64 +56,38 @@ pub(crate) fn assemble(
     sums: Sums<'_>,
 ) {
     let Sums { forces, matrix } = sums;
-    let (triangles, places) = (mesh.triangles(), &pattern.triangle_places);
-    let (gradients, areas) = (mesh.shape_gradients(), mesh.rest_areas());
-    let (mut eight, mut answer) = (Eight::NONE, Answer::NONE);
-    for first in (0..triangles.len()).step_by(WIDE) {
-        let all = first..triangles.len().min(first + WIDE);
-        for (lane, t) in all.clone().enumerate() {
-            let x = triangles[t].map(|v| x[v as usize]);
-            eight.set(lane, x, &gradients[t], areas[t]);
+    let shapes = mesh.shape_gradients().iter().zip(mesh.rest_areas());
+    for ((t, (gradients, area)), places) in
+        mesh.triangles().iter().zip(shapes).zip(&pattern.triangle_places)
+    {
+        let [i, j, k] = t.map(|v| v as usize);
+        let e = Element::new([x[i], x[j], x[k]], gradients);
+        let (push, modes) = e.respond(constants);
+        let beta = gradients.map(|g| Vec2::new(e.v1.dot(g), e.v1.perp().dot(g)));
+        for (v, b) in [i, j, k].into_iter().zip(&beta) {
+            forces[v] -= (e.u1 * (push.x * b.x) + e.u2 * (push.y * b.y)) * *area;
         }
-        simd::run(Ask { eight: &eight, constants, scale, answer: &mut answer });
-        for (lane, t) in all.enumerate() {
-            let [i, j, k] = triangles[t].map(|v| v as usize);
-            let (corners, g, area) = ([x[i], x[j], x[k]], &gradients[t], areas[t]);
-            let (pushes, mut blocks) = if answer.is_sound(lane) {
-                let push = |corner| answer.push(corner, lane);
-                let block = |pair| answer.block(pair, lane);
-                ([0, 1, 2].map(push), [0, 1, 2].map(block))
-            } else {
-                alone(corners, g, area, constants, scale)
-            };
-            for (v, push) in [i, j, k].into_iter().zip(pushes) {
-                forces[v] -= push;
+        let block = |a: usize, b: usize| e.block(&modes, beta[a], beta[b], area * scale);
+        let (mut h01, mut h02, mut h12) = (block(0, 1), block(0, 2), block(1, 2));
+        if constants.orthotropic {
+            let axes = Axes::new([x[i], x[j], x[k]], gradients, &constants.sum);
+            for (v, g) in [i, j, k].into_iter().zip(gradients) {
+                forces[v] -= axes.push(*g) * *area;
             }
-            if constants.orthotropic {
-                let axes = Axes::new(corners, g, &constants.sum);
-                for (v, g) in [i, j, k].into_iter().zip(g) {
-                    forces[v] -= axes.push(*g) * area;
-                }
-                for (block, [a, b]) in blocks.iter_mut().zip(PAIRS) {
-                    *block += axes.block(g[a], g[b]) * (area * scale);
-                }
-            }
-            for (place, h) in places[t].iter().zip(&blocks) {
-                matrix.add(*place, h);
-            }
-            let [h01, h02, h12] = blocks;
-            let (h10, h20, h21) = (h01.transpose(), h02.transpose(), h12.transpose());
-            // A shift of the whole triangle costs nothing: rows sum to zero.
-            matrix.diagonal[i] -= h01 + h02;
-            matrix.diagonal[j] -= h10 + h12;
-            matrix.diagonal[k] -= h20 + h21;
+            let [g0, g1, g2] = *gradients;
+            h01 += axes.block(g0, g1) * (area * scale);
+            h02 += axes.block(g0, g2) * (area * scale);
+            h12 += axes.block(g1, g2) * (area * scale);
         }
+        for (place, h) in places.iter().zip([&h01, &h02, &h12]) {
+            matrix.add(*place, h);
+        }
+        let (h10, h20, h21) = (h01.transpose(), h02.transpose(), h12.transpose());
+        // A shift of the whole triangle costs nothing: rows sum to zero.
+        matrix.diagonal[i] -= h01 + h02;
+        matrix.diagonal[j] -= h10 + h12;
+        matrix.diagonal[k] -= h20 + h21;
     }
-}
-
-/// What is taken from the corners' forces, and the Hessian's blocks, of one triangle by itself.
-fn alone(
-    x: [Vec3A; 3],
-    gradients: &[Vec2; 3],
-    area: f32,
-    constants: Constants,
-    scale: f32,
-) -> ([Vec3A; 3], [Mat3A; 3]) {
-    let e = Element::new(x, gradients);
-    let (push, modes) = e.respond(constants);
-    let beta = gradients.map(|g| Vec2::new(e.v1.dot(g), e.v1.perp().dot(g)));
-    let pushes = beta.map(|b| (e.u1 * (push.x * b.x) + e.u2 * (push.y * b.y)) * area);
-    (pushes, PAIRS.map(|[a, b]| e.block(&modes, beta[a], beta[b], area * scale)))
 }
 
 /// A triangle's deformation: principal directions in space and in the rest plane, stretches.
