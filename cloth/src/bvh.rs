@@ -328,3 +328,58 @@ fn ray_meets(bounds: &[Vec3A; 2], from: Vec3A, ray: Vec3A) -> bool {
     let enter = a.min(b).max_element().max(0.0);
     enter <= a.max(b).min_element() + 1e-6
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lab::shapes::Chance;
+
+    /// A closed, wavy ring of `n` by `m` quads.
+    fn ring(n: usize, m: usize) -> (Vec<Vec3>, Vec<[u32; 3]>) {
+        let angle = |i: usize, count: usize| std::f32::consts::TAU * i as f32 / count as f32;
+        let (mut points, mut triangles) = (Vec::new(), Vec::new());
+        let at = |i: usize, j: usize| (i % n * m + j % m) as u32;
+        for (i, j) in (0..n).flat_map(|i| (0..m).map(move |j| (i, j))) {
+            let (u, v) = (angle(i, n), angle(j, m));
+            let thick = 0.15 + 0.03 * (5.0 * u).sin() * (3.0 * v).cos();
+            let out = 0.4 + thick * v.cos();
+            points.push(Vec3::new(out * u.cos(), 1.0 + thick * v.sin(), out * u.sin()));
+            triangles.push([at(i, j), at(i + 1, j), at(i, j + 1)]);
+            triangles.push([at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)]);
+        }
+        (points, triangles)
+    }
+
+    #[test]
+    fn the_closest_point_is_that_of_asking_every_triangle() {
+        let mut chance = Chance::new(5);
+        // Also trees of one leaf, and of two.
+        for (n, m) in [(24, 18), (3, 3), (1, 3), (1, 5)] {
+            let (points, triangles) = ring(n, m);
+            let tree = Bvh::new(&points, &triangles);
+            let mut fit = Fit::default();
+            let moved: Vec<Vec3> = points.iter().map(|p| *p * 1.1 + Vec3::Z).collect();
+            tree.refit(&points, &mut fit);
+            tree.refit(&moved, &mut fit);
+            for round in 0..400 {
+                let mut by_chance = || Vec3::from_array(std::array::from_fn(|_| chance.signed()));
+                let point = moved[round * 7 % moved.len()] + by_chance() * 0.06;
+                let limit2 = if round % 3 == 0 { 0.03f32.powi(2) } else { 4.0 };
+                let near = (round % 2 == 0).then_some((round * 31 % triangles.len()) as u32);
+                let to = |t: &[u32; 3]| {
+                    let corners = t.map(|v| Vec3A::from(moved[v as usize]));
+                    let on = triangle::closest(&corners, point.into());
+                    on.point.distance_squared(point.into())
+                };
+                let least = triangles.iter().map(to).fold(f32::INFINITY, f32::min);
+                let found = tree.closest_from(&fit, point, limit2, near);
+                let wanted = (least < limit2).then_some(least);
+                assert_eq!(found.map(|hit| hit.distance2), wanted, "{n} x {m}, round {round}");
+                if let Some(hit) = found {
+                    let of_triangle = to(&triangles[hit.triangle as usize]);
+                    assert_eq!(of_triangle.to_bits(), hit.distance2.to_bits());
+                }
+            }
+        }
+    }
+}
