@@ -28,6 +28,7 @@ def main():
     parser.add_argument("--out", type=pathlib.Path, required=True)
     parser.add_argument("--toile", default="toile")
     parser.add_argument("--workers", default="1")
+    parser.add_argument("--vertices", default="", help="of the garment; default: as the scene says")
     a = parser.parse_args()
     a.out.mkdir(parents=True, exist_ok=True)
     text = a.scene.read_text()
@@ -47,6 +48,7 @@ def main():
             store = str(a.out / f"store-{seconds}")
             explore = [a.toile, "explore", "--scene", str(scene), "--store", store,
                        "--workers", a.workers, "--json", "--frames"]
+            explore[2:2] = ["--vertices", a.vertices] if a.vertices else []
             first = json.loads(run(*explore, str(check["edges"])))
             last = json.loads(run(*explore, str(check["edges"] + a.frames)))
         finally:

@@ -72,6 +72,12 @@ pub struct Up {
     /// Simulated players, at most as many as the server takes.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(..=1000))]
     pub players: u32,
+    /// How they walk: random:SEED, clip:A,B,... or edges:FILE.
+    #[arg(long, default_value = "random:1")]
+    pub walk: String,
+    /// How they walk from a time on, e.g. 90s=clip:jump,kick; may be given again.
+    #[arg(long, value_name = "TIME=WALK", value_parser = later_walk)]
+    pub then: Vec<(Duration, String)>,
     /// Stop after this long, e.g. 60s, 5m [default: until Ctrl-C].
     #[arg(long = "for", value_name = "TIME", value_parser = duration)]
     pub time: Option<Duration>,
@@ -84,6 +90,9 @@ pub struct Up {
     /// Simulation threads [default: all cores].
     #[arg(long)]
     pub workers: Option<usize>,
+    /// Vertices of the garment, exactly [default: as the scene says].
+    #[arg(long, value_name = "N")]
+    pub vertices: Option<usize>,
     /// Which merges are undone first: greedy, visited or predictive (see `toile explore`).
     #[arg(long, default_value = "greedy", value_parser = policy)]
     pub policy: Policy,
@@ -521,6 +530,11 @@ fn duration(text: &str) -> Result<Duration, String> {
     };
     let value: f64 = digits.parse().map_err(|_| "expected a time such as 60s or 5m".to_string())?;
     Duration::try_from_secs_f64(value * seconds).map_err(|e| e.to_string())
+}
+
+fn later_walk(text: &str) -> Result<(Duration, String), String> {
+    let (time, walk) = text.split_once('=').ok_or("write TIME=WALK, as in 90s=clip:jump,kick")?;
+    Ok((duration(time)?, walk.to_owned()))
 }
 
 fn wind(text: &str) -> Result<f32, String> {

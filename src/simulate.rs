@@ -139,7 +139,7 @@ fn start_at_clip(scene: &mut Scene, spec: &WalkSpec) {
 }
 
 /// The walk that `toile play` would take from the scene's start.
-fn walk(scene: &Scene, spec: &WalkSpec) -> Result<Walk> {
+pub fn walk(scene: &Scene, spec: &WalkSpec) -> Result<Walk> {
     let walked = Arc::new(client_lib::Scene::new(scene_chunk(scene))?);
     Ok(Walk::new(spec, &walked, scene.start)?)
 }

@@ -6,8 +6,9 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow};
-use client_lib::ClientConfig;
+use client_lib::{ClientConfig, WalkSpec};
 use explorer::explore::{ExploreOptions, Progress, Summary};
+use explorer::grow::policy::Policy;
 use explorer::pack::upsampler::UpsamplerSettings;
 use explorer::scene::Scene;
 use loadtest::{Players, PlayersConfig, Totals};
@@ -19,7 +20,7 @@ use crate::live::Live;
 use crate::recall::Named;
 use crate::store::Opened;
 use crate::view::{self, View};
-use crate::{args, format, place, scene, store};
+use crate::{args, format, place, scene, simulate, store};
 
 /// Between two looks at how it goes.
 const POLL: Duration = Duration::from_millis(100);
@@ -39,6 +40,10 @@ struct Outcome {
     bytes_sent: u64,
     versions_applied: Vec<u64>,
     first_version_s: Option<f64>,
+    policy: Policy,
+    visited_p95_mm: f64,
+    visited_mean_mm: f64,
+    visited_merges_per_s: f64,
     decode_us_p50: f64,
     resident_bytes_max: usize,
 }
@@ -46,7 +51,8 @@ struct Outcome {
 /// Runs the whole line until Ctrl-C or the time is over.
 pub fn run(a: &args::Up) -> Result<()> {
     let start = Instant::now();
-    let scene = scene::load(&a.scene)?;
+    let scene = scene::load_with(&a.scene, a.vertices)?;
+    let walks = walks(a, &scene)?;
     let store_place = a.store.clone().unwrap_or_else(|| format!("store/{}", scene.name));
     let opened = store::create_store(&store_place)?;
     let work = place::work(&opened, a.work.clone())?;
@@ -76,10 +82,11 @@ pub fn run(a: &args::Up) -> Result<()> {
         should_stop: stop.asked(),
         ..ExploreOptions::default()
     };
-    let named = Named::new(&a.scene, None);
+    let named = Named::new(&a.scene, a.vertices);
     let bare = view::Bare::new(&scene);
     let explorer = Explorer::start((scene, named), opened, work, options)?;
-    let players = players(&server, a.players)?;
+    let config = PlayersConfig { walks, ..PlayersConfig::new(client(&server)) };
+    let players = Players::start(a.players as usize, &config).context("starting the players")?;
     let server_page = server.http_addr().map(|http| format!("http://{http}/"));
     let view = View::start(client(&server), Some(tag_token), a.page, server_page, bare)?;
     if !a.json {
@@ -142,9 +149,17 @@ fn client(server: &Server) -> ClientConfig {
     }
 }
 
-fn players(server: &Server, count: u32) -> Result<Players> {
-    let config = PlayersConfig::new(client(server));
-    Players::start(count as usize, &config).context("starting the players")
+/// How players walk, by time. A walk that this scene does not have is told now, not when its time comes.
+fn walks(a: &args::Up, scene: &Scene) -> Result<Vec<(Duration, WalkSpec)>> {
+    let mut walks = vec![(Duration::ZERO, WalkSpec::parse(&a.walk)?)];
+    for (from, text) in &a.then {
+        walks.push((*from, WalkSpec::parse(text)?));
+    }
+    walks.sort_by_key(|(from, _)| *from);
+    for (_, spec) in &walks {
+        simulate::walk(scene, spec)?;
+    }
+    Ok(walks)
 }
 
 struct Watched {
@@ -173,7 +188,7 @@ fn watch(
         if stats.version > version {
             version = stats.version;
             watched.first_version.get_or_insert(start.elapsed());
-            let said = progress.as_ref().map_or("is in the store already".into(), line);
+            let said = progress.as_ref().map_or("is in the store already".into(), version_line);
             live.note(&format!(
                 "{:6.1} s  version {version}: {said}",
                 start.elapsed().as_secs_f64()
@@ -186,6 +201,12 @@ fn watch(
     }
     live.done();
     watched
+}
+
+/// A version, and what players see of its merges.
+fn version_line(p: &Progress) -> String {
+    let seen = |mm| format!("; players pass {mm:.0} mm of merges a second");
+    line(p) + &p.seen_mm_per_s.map_or(String::new(), seen)
 }
 
 fn players_line(t: &Totals, bytes_sent: u64) -> String {
@@ -213,6 +234,10 @@ fn outcome(s: &Summary, t: Totals, bytes_sent: u64, first: Option<Duration>) -> 
         bytes_sent,
         versions_applied: t.versions_applied,
         first_version_s: first.map(|d| d.as_secs_f64()),
+        policy: s.policy,
+        visited_p95_mm: s.visited_p95_mm,
+        visited_mean_mm: s.visited_mean_mm,
+        visited_merges_per_s: s.visited_merges_per_s,
         decode_us_p50: t.decode_us_p50,
         resident_bytes_max: t.resident_bytes_max,
     }
@@ -232,6 +257,10 @@ fn print(o: &Outcome) {
         o.frames_missed,
         o.shown_error_mm_p99,
         format::bytes(o.bytes_sent)
+    );
+    println!(
+        "policy {}; merges as players pass them: mean {:.1} mm, {:.2} a second",
+        o.policy, o.visited_mean_mm, o.visited_merges_per_s
     );
     println!("the same command goes on from here");
 }

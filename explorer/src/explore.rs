@@ -317,7 +317,8 @@ async fn run(
         return Err(ExploreError::StoreAhead { stored, folder, known });
     }
     let clips = clips(scene, &options.clips)?;
-    let mut run = Run { start: Instant::now(), first: work.graph().next_id().0, drape_cpu_s: 0.0 };
+    let first = work.graph().next_id().0;
+    let mut run = Run { start: Instant::now(), first, drape_cpu_s: 0.0, seen_mm_per_s: None };
     let workers = options.workers.clamp(1, WORKERS_MAX);
     let mut simulators: Vec<Box<dyn Simulator>> =
         (0..workers).map(|_| setup.simulators.simulator()).collect();
@@ -423,6 +424,7 @@ async fn between_rounds(
         let soon = work.ledger().is_round_of_tags();
         publish(work, publisher, (newest, soon)).await?;
         *behind = false;
+        run.published(work);
         progress(&run.progress(setup, work, None));
     }
     Ok(reached(work.graph(), setup.options))

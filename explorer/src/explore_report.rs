@@ -44,6 +44,9 @@ pub struct Progress {
     pub quality: FrameQuality,
     /// CPU seconds of jobs (wall seconds where the system does not tell), over all runs.
     pub simulate_cpu_s: f64,
+    /// What players see of merges in a second of play, by the counts that had arrived when the newest version
+    /// of this run was published (mm): the errors of the merges that they pass, summed.
+    pub seen_mm_per_s: Option<f64>,
     /// Why the job that ended just now was given up.
     pub failure: Option<String>,
     /// What a frame costs, as far as is known.
@@ -152,9 +155,17 @@ pub(super) struct Run {
     pub first: u64,
     /// CPU seconds of the drape; 0 where it was made before.
     pub drape_cpu_s: f64,
+    /// See [`Progress::seen_mm_per_s`].
+    pub seen_mm_per_s: Option<f64>,
 }
 
 impl Run {
+    /// Looks at what players see, for a version that was just published.
+    pub fn published(&mut self, work: &Work) {
+        let [_, mean_mm, merges_per_s] = visited(work);
+        self.seen_mm_per_s = Some(mean_mm * merges_per_s);
+    }
+
     pub fn progress(&self, setup: &Setup<'_>, work: &Work, failure: Option<&JobError>) -> Progress {
         let (ledger, graph) = (work.ledger(), work.graph());
         Progress {
@@ -170,6 +181,7 @@ impl Run {
             failed_jobs: ledger.set_aside().len() as u64,
             quality: *ledger.quality(),
             simulate_cpu_s: work.simulate_cpu_s(),
+            seen_mm_per_s: self.seen_mm_per_s,
             failure: failure.map(ToString::to_string),
             cost: self.cost(setup, work),
         }

@@ -6,7 +6,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use client_lib::{Client, ClientConfig, Histogram, PlayStats, Walk, WalkSpec, decode};
+use client_lib::{Client, ClientConfig, Histogram, PlayStats, Scene, Walk, WalkSpec, decode};
+use protocol::PoseId;
 use serde::Serialize;
 
 /// A player this far behind its clock does not try to catch up.
@@ -36,16 +37,18 @@ pub struct PlayersConfig {
     pub garment: Option<String>,
     /// How fast they play.
     pub pace: Pace,
-    /// Player `i` walks by the seed `seed + i`.
-    pub seed: u64,
+    /// How they walk, each walk from so long after their start on; the first from the start. A random
+    /// walk's seed is raised by the player's number. One that ends is the end of the player.
+    pub walks: Vec<(Duration, WalkSpec)>,
     /// Whether every frame is decoded, as a game would.
     pub decodes: bool,
 }
 
 impl PlayersConfig {
-    /// Real time, every frame decoded.
+    /// Real time, at random, every frame decoded.
     pub fn new(client: ClientConfig) -> Self {
-        Self { client, garment: None, pace: Pace::RealTime, seed: 1, decodes: true }
+        let walks = vec![(Duration::ZERO, WalkSpec::Random(1))];
+        Self { client, garment: None, pace: Pace::RealTime, walks, decodes: true }
     }
 }
 
@@ -156,7 +159,11 @@ impl Players {
         for number in 0..count as u64 {
             let report = Arc::new(Mutex::new(Report::default()));
             let mut config = config.clone();
-            config.seed += number;
+            for (_, walk) in &mut config.walks {
+                if let WalkSpec::Random(seed) = walk {
+                    *seed = seed.wrapping_add(number);
+                }
+            }
             config.client.jitter_seed = config.client.jitter_seed.wrapping_add(number);
             let (stop, for_thread) = (Arc::clone(&stop), Arc::clone(&report));
             let thread = std::thread::Builder::new()
@@ -209,6 +216,30 @@ fn lock(report: &Mutex<Report>) -> std::sync::MutexGuard<'_, Report> {
     report.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// A player's walks, one after another.
+struct Walks<'a> {
+    begun: Instant,
+    walks: &'a [(Duration, WalkSpec)],
+    current: Option<Walk>,
+}
+
+impl<'a> Walks<'a> {
+    fn new(walks: &'a [(Duration, WalkSpec)]) -> Self {
+        Self { begun: Instant::now(), walks, current: None }
+    }
+
+    /// The next pose after `pose`; none at a walk's end.
+    fn next(&mut self, scene: &Arc<Scene>, pose: PoseId) -> anyhow::Result<Option<PoseId>> {
+        if let [(from, spec), later @ ..] = self.walks
+            && (self.current.is_none() || *from <= self.begun.elapsed())
+        {
+            self.current = Some(Walk::new(spec, scene, pose)?);
+            self.walks = later;
+        }
+        Ok(self.current.as_mut().and_then(Walk::next))
+    }
+}
+
 /// One player's life.
 fn play(config: &PlayersConfig, stop: &AtomicBool, report: &Mutex<Report>) -> anyhow::Result<()> {
     let client = Client::connect(config.client.clone())?;
@@ -224,7 +255,7 @@ fn play(config: &PlayersConfig, stop: &AtomicBool, report: &Mutex<Report>) -> an
     let garment = config.garment.as_deref();
     let mut character = client.character(garment)?;
     let scene = client.scene(garment)?;
-    let mut walk = Walk::new(&WalkSpec::Random(config.seed), &scene, character.pose())?;
+    let mut walks = Walks::new(&config.walks);
     let frame = Duration::from_secs_f32(1.0 / scene.fps());
     let mut positions = vec![0.0; character.version().basis().rows()];
     let mut next_tick = Instant::now();
@@ -232,7 +263,7 @@ fn play(config: &PlayersConfig, stop: &AtomicBool, report: &Mutex<Report>) -> an
         if config.pace == Pace::Fast && character.stats().frames.is_multiple_of(AHEAD_FRAMES) {
             client.wait_ahead(AHEAD_MAX);
         }
-        let Some(pose) = walk.next() else { break };
+        let Some(pose) = walks.next(&scene, character.pose())? else { break };
         character.step(pose);
         if config.decodes {
             let began = Instant::now();
