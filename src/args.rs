@@ -275,6 +275,9 @@ pub struct Plot {
     /// Folder for the SVG and PNG files.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Draw the newest graph, whatever players have.
+    #[arg(long)]
+    pub newest: bool,
     /// Where things are.
     #[command(flatten)]
     pub explored: Explored,

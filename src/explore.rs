@@ -42,6 +42,7 @@ pub fn run(a: args::Explore) -> Result<()> {
         should_stop: stop.asked(),
         ..ExploreOptions::default()
     };
+    let otherwise_ended = a.error.is_some() || a.time.is_some();
     let mut live = Live::new(a.frames);
     let mut told = false;
     let mut version = None;
@@ -51,7 +52,7 @@ pub fn run(a: args::Explore) -> Result<()> {
         }
         if !told && progress.phase != Phase::Drape {
             told = true;
-            live.note(&forecast(progress, a.frames));
+            live.note(&forecast(progress, a.frames, otherwise_ended));
         }
         if progress.version != version {
             version = progress.version;
@@ -108,10 +109,13 @@ pub fn explore_blocking(
 }
 
 /// What the run will cost, by what a frame cost so far.
-fn forecast(p: &Progress, frames: Option<u64>) -> String {
-    let left = frames.unwrap_or(p.initial_frames.max(1000)).saturating_sub(p.simulated_frames);
+fn forecast(p: &Progress, frames: Option<u64>, otherwise_ended: bool) -> String {
+    // The initial pass is made whole, however few frames are asked for.
+    let end = frames.unwrap_or(1000).max(p.initial_frames);
+    let left = end.saturating_sub(p.simulated_frames);
     let what = match frames {
-        Some(frames) => format!("up to {frames} frames, {left} are left: "),
+        Some(_) => format!("up to {end} frames, {left} are left: "),
+        None if otherwise_ended => format!("{left} more frames: "),
         None => format!("no end was given; {left} more frames: "),
     };
     let free = p
@@ -228,7 +232,8 @@ impl Stop {
 
     /// Also stops this long from now.
     pub fn after(mut self, time: Option<Duration>) -> Self {
-        self.deadline = time.map(|time| Instant::now() + time);
+        // A time that no clock reaches is none.
+        self.deadline = time.and_then(|time| Instant::now().checked_add(time));
         self
     }
 

@@ -81,6 +81,13 @@ pub fn run(a: &args::Inspect) -> Result<()> {
         } else {
             print(&summary);
         }
+        if let Some(replay) = summary.replay.as_ref().filter(|replay| !replay.is_exact()) {
+            anyhow::bail!(
+                "replaying gave other frames than are on record ({} states differ): the work folder's states are \
+                 damaged, or another version of the simulator made them",
+                replay.states_differing
+            );
+        }
         if let Some(reason) = &garment.not_total {
             anyhow::bail!("garment {}: not total: {reason}", garment.name);
         }
@@ -207,8 +214,8 @@ fn print(s: &Summary<'_>) {
     }
     if let Some(r) = &s.replay {
         println!(
-            "replayed  {} merges, {} frames: largest difference of an error {} mm",
-            r.replayed, r.frames, r.largest_difference_mm
+            "replayed  {} merges, {} frames: largest difference of an error {} mm, {} states differ",
+            r.replayed, r.frames, r.largest_difference_mm, r.states_differing
         );
     }
 }

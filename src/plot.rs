@@ -11,14 +11,14 @@ use crate::{args, store};
 /// Pixels to a unit of the PNG files.
 const SCALE: u32 = 2;
 
-/// Draws everything there is to draw of a store.
+/// Draws everything there is to draw of a store: of the version that players have, or of all that was simulated.
 pub fn run(a: &args::Plot) -> Result<()> {
     let opened = store::open_store(&a.store)?;
     let explored = recall(&opened, &a.explored)?;
     std::fs::create_dir_all(&a.out)
         .with_context(|| format!("the folder {} cannot be made", a.out.display()))?;
     let (archive, scene) = (&explored.archive, &explored.scene);
-    let view = archive.view(archive.graph().commit());
+    let view = archive.view(if a.newest { archive.graph().commit() } else { archive.shown() });
     let plots = [
         ("error", figures::error_curve(archive.graph())),
         ("merge-errors", figures::merge_histogram(&view)),
@@ -31,6 +31,9 @@ pub fn run(a: &args::Plot) -> Result<()> {
     for (name, by) in drawings {
         let drawing = figures::graph_drawing(&view, scene, by);
         write(&a.out, name, &drawing.svg(), &drawing.png(1)?)?;
+    }
+    if !a.newest && archive.shown() < archive.graph().commit() {
+        eprintln!("drawn as players have it; --newest draws all that was simulated");
     }
     Ok(())
 }

@@ -207,6 +207,13 @@ pub struct Replay {
     pub states_differing: u64,
 }
 
+impl Replay {
+    /// Whether all came out as it is on record.
+    pub fn is_exact(&self) -> bool {
+        self.largest_difference_mm <= 0.0 && self.states_differing == 0
+    }
+}
+
 /// Why a merge cannot be replayed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]

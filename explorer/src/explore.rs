@@ -476,7 +476,8 @@ async fn steer(
 fn disk_is_nearly_full(setup: &Setup<'_>, work: &Work) -> bool {
     let states = u64::from(setup.scene.exploration.round_jobs.max(1)) * JOB_STATES_MAX as u64;
     // A store's chunks of them, with a basis, are smaller than the exact states.
-    let needed = states.min(100_000) * work.state_bytes() + setup.options.keep_free_bytes;
+    let needed =
+        (states.min(100_000) * work.state_bytes()).saturating_add(setup.options.keep_free_bytes);
     let short = |folder: &Path| free_bytes(folder).is_some_and(|free| free < needed);
     short(setup.work) || setup.folder.is_some_and(short)
 }

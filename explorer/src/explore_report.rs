@@ -194,8 +194,7 @@ impl Run {
             0 => self.drape_cpu_s / f64::from(drape_frames),
             frames => work.simulate_cpu_s() / frames as f64,
         };
-        let free_bytes = if frames == 0 { free_bytes(setup.work) } else { None };
-        FrameCost { cpu_s, work_bytes: work.state_bytes(), free_bytes }
+        FrameCost { cpu_s, work_bytes: work.state_bytes(), free_bytes: free_bytes(setup.work) }
     }
 
     pub fn summary(&self, setup: &Setup<'_>, work: &Work, end: End) -> Summary {
@@ -238,7 +237,7 @@ impl Run {
             failed_jobs: ledger.set_aside().len() as u64,
             frames_retried: ledger.quality().frames_retried,
             frames_flagged: ledger.quality().frames_flagged,
-            policy: ledger.steering().policy(),
+            policy: setup.options.policy,
             classes: classes(setup, work),
             merges_across_classes: graph.states().filter(|s| crossed(s)).count() as u64,
             implausible_merges: graph.states().filter(|s| implausible(s)).count() as u64,

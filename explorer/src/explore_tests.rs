@@ -394,6 +394,20 @@ fn other_inputs_other_stores_and_second_explorers_are_refused() {
 }
 
 /// Every file below a folder, by path, but the work folder's.
+#[test]
+fn states_without_their_journal_are_refused_and_kept() {
+    let (folder, mut store) = (tempfile::tempdir().unwrap(), Memory::default());
+    let (scene, toy) = (toy_scene(), Toy::new(150));
+    explore(&scene, &toy, (folder.path(), &mut store), &options(60)).unwrap();
+    let [journal, states] = files(folder.path());
+    std::fs::remove_file(folder.path().join("journal")).unwrap();
+    let error = explore(&scene, &toy, (folder.path(), &mut store), &options(60)).unwrap_err();
+    assert!(error.to_string().contains("no journal"), "{error}");
+    std::fs::write(folder.path().join("journal"), &journal).unwrap();
+    assert_eq!(files(folder.path()), [journal, states]);
+    explore(&scene, &toy, (folder.path(), &mut store), &options(80)).unwrap();
+}
+
 fn tree(root: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
     let mut found = std::collections::BTreeMap::new();
     let mut folders = vec![root.to_owned()];

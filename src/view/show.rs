@@ -450,6 +450,7 @@ impl Show {
 
     fn crowd(&mut self, count: usize) -> Result<()> {
         ensure!((1..=CROWD_MAX).contains(&count), "1 to {CROWD_MAX} characters");
+        ensure!(self.steering.is_some(), "nothing is played yet");
         let mut actors = Vec::new();
         let mut walks = Vec::new();
         let side = (count as f32).sqrt().ceil();

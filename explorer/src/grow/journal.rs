@@ -16,7 +16,8 @@
 //! they were), and a short tail; killed at any instant it is the old one or the new one.
 //!
 //! A record is on the disk before the next is written, so only the last can be torn: it is cut
-//! off when the journal is opened. A bad record with a good one behind it is damage, and refused.
+//! off when the journal is opened. A bad record with a good one anywhere behind it, or with more behind it than one
+//! record can have, is damage, and refused.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -233,11 +234,8 @@ impl Journal {
     }
 
     fn cut_tail(&mut self, length: u64) -> Result<u64, JournalError> {
-        if let Some(size) = self.declared(self.end, length)? {
-            let behind = self.end + (LENGTH_BYTES + size + CHECK_BYTES) as u64;
-            if self.payload(behind, length)?.is_some() {
-                return Err(JournalError::Damaged(self.end));
-            }
+        if self.is_damage(length)? {
+            return Err(JournalError::Damaged(self.end));
         }
         if length > self.end {
             self.file.set_len(self.end)?;
@@ -245,6 +243,29 @@ impl Journal {
         }
         Ok(length - self.end)
     }
+
+    /// Whether what follows the last good record is more than one that was torn. The length that a bad record
+    /// declares may be what is bad, so a good one is looked for at every place.
+    fn is_damage(&self, length: u64) -> io::Result<bool> {
+        let behind = length - self.end;
+        if behind > (LENGTH_BYTES + RECORD_BYTES_MAX + CHECK_BYTES) as u64 {
+            return Ok(true);
+        }
+        let mut bytes = vec![0; behind as usize];
+        files::read_at(&self.file, &mut bytes, self.end)?;
+        Ok((1..bytes.len()).any(|at| is_record(&bytes[at..], self.end + at as u64)))
+    }
+}
+
+/// Whether these bytes, at this offset of a journal, begin with a whole record.
+fn is_record(bytes: &[u8], offset: u64) -> bool {
+    let Some((size, rest)) = bytes.split_first_chunk::<LENGTH_BYTES>() else { return false };
+    let size = u32::from_le_bytes(*size) as usize;
+    if size == 0 || rest.len() < size || rest.len() - size < CHECK_BYTES {
+        return false;
+    }
+    let (payload, check) = rest.split_at(size);
+    check[..CHECK_BYTES] == checksum(offset, payload)
 }
 
 fn frame(record: &Record, offset: u64) -> io::Result<Vec<u8>> {
@@ -344,11 +365,17 @@ mod tests {
             std::fs::write(&path, &torn).unwrap();
             assert_eq!(read(&path).unwrap().0, [record(0), record(1)]);
         }
-        let mut damaged = bytes;
-        damaged[8 + size + 6] ^= 1;
-        std::fs::write(&path, &damaged).unwrap();
-        let error = read(&path).unwrap_err();
-        assert!(matches!(error, JournalError::Damaged(at) if at as usize == 8 + size));
+        // Wherever it is: in the length, the payload, or the check sum.
+        for at in 8 + size..8 + 2 * size {
+            for bit in 0..8 {
+                let mut damaged = bytes.clone();
+                damaged[at] ^= 1 << bit;
+                std::fs::write(&path, &damaged).unwrap();
+                let error = read(&path).unwrap_err();
+                assert!(matches!(error, JournalError::Damaged(at) if at as usize == 8 + size));
+                assert_eq!(std::fs::read(&path).unwrap(), damaged, "nothing is cut");
+            }
+        }
         std::fs::write(&path, b"something else").unwrap();
         assert!(matches!(read(&path).unwrap_err(), JournalError::Foreign));
     }

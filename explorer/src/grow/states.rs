@@ -41,6 +41,18 @@ impl StateFile {
         Ok(Self { file, vertex_count: vertex_count as usize })
     }
 
+    /// Whether there is a file with more than a header.
+    ///
+    /// # Errors
+    /// The system does not tell.
+    pub fn holds_states(path: &Path) -> io::Result<bool> {
+        match std::fs::metadata(path) {
+            Ok(found) => Ok(found.len() > HEADER_BYTES as u64),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+            Err(error) => Err(error),
+        }
+    }
+
     /// Opens the file of `states` states; cuts off what lies beyond them.
     ///
     /// # Errors

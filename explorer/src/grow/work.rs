@@ -75,6 +75,12 @@ pub enum WorkError {
         /// What is wrong.
         source: JournalError,
     },
+    /// States without the journal that tells what they are.
+    #[error(
+        "{}: there are states here, and no journal; put the journal back, or take another work folder",
+        .0.display()
+    )]
+    NoJournal(PathBuf),
     /// The journal's records contradict each other.
     #[error("{}: {source}; restore a copy or take another work folder", .path.display())]
     Records {
@@ -135,6 +141,8 @@ impl Work {
             let count = if draped { ledger.graph().next_id().0 } else { 0 };
             let states = StateFile::open(&states_path, header.vertex_count, &digest, count);
             (journal, states.map_err(at(&states_path))?)
+        } else if StateFile::holds_states(&states_path).map_err(at(&states_path))? {
+            return Err(WorkError::NoJournal(folder.to_owned()));
         } else {
             let states = StateFile::create(&states_path, header.vertex_count, &digest);
             let states = states.map_err(at(&states_path))?;

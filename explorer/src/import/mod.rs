@@ -313,8 +313,10 @@ impl Place<'_> {
         SceneError::File { path: self.scene.to_owned(), source }
     }
 
+    /// Where a program is started: absolute, also of a bare file name.
     fn folder(&self) -> PathBuf {
-        let folder = self.scene.parent().unwrap_or(Path::new(""));
+        let folder = self.scene.parent().filter(|folder| *folder != Path::new(""));
+        let folder = folder.unwrap_or(Path::new("."));
         std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned())
     }
 

@@ -68,6 +68,12 @@ fn tube(half_m: f32) -> String {
 }
 
 #[test]
+fn a_bare_file_name_lies_in_the_current_folder() {
+    let place = super::Place { scene: std::path::Path::new("s.toml"), data: None };
+    assert_eq!(place.folder(), std::env::current_dir().unwrap());
+}
+
+#[test]
 fn the_small_scene_loads_and_is_measured() {
     let files = Files::new();
     files.write(

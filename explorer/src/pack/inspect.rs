@@ -1,7 +1,7 @@
 //! What a store holds: every promise of a version checked, and its figures.
 
 use object_store::ObjectStore;
-use protocol::links::LinkPage;
+use protocol::links::{LinkEntry, LinkPage};
 use protocol::manifest::{GarmentVersion, VersionStats};
 use protocol::region::{RegionChunk, RegionEntry};
 use protocol::scene::{GarmentChunk, SceneChunk};
@@ -105,6 +105,18 @@ pub enum InspectError {
         /// In a region (m).
         found_m: f32,
     },
+    /// The manifest states another figure than its link pages.
+    #[error("garment {garment:?}: the manifest states {stated} {what}, its links hold {found}")]
+    Figure {
+        /// Name of the garment.
+        garment: String,
+        /// Which figure.
+        what: &'static str,
+        /// In the manifest.
+        stated: f64,
+        /// In the link pages.
+        found: f64,
+    },
 }
 
 /// What is wrong inside a chunk.
@@ -138,7 +150,8 @@ pub enum ChunkError {
 }
 
 /// Reads a version (the head where `number` is `None`) and checks its signature, every chunk's
-/// hash, that every region decodes with the basis, that every state is covered, and totality.
+/// hash, that every region decodes with the basis, that every state is covered, that the stated figures of
+/// states and merges are those of the links, and totality.
 ///
 /// # Errors
 /// The first broken promise, by name. A table that is not total is no error: see
@@ -186,6 +199,7 @@ async fn inspect_garment(
     }
     let states = pages.iter().map(|page| page.entries.len() as u64).sum();
     check_coverage(garment, &regions, states)?;
+    check_figures(garment, &pages)?;
     let table = LinkTable::new(&pages, scene.poses.len(), &scene.edges);
     Ok(GarmentInspection {
         name: garment.name.clone(),
@@ -277,6 +291,36 @@ fn check_coverage(
     Err(InspectError::Uncovered { garment: garment.name.clone(), state: StateId(end) })
 }
 
+/// States, merges and their errors, as the links have them.
+fn check_figures(garment: &GarmentVersion, pages: &[LinkPage]) -> Result<(), InspectError> {
+    let (mut states, mut merges, mut sum_m, mut worst_m) = (0u64, 0u64, 0f64, 0f32);
+    for entry in pages.iter().flat_map(|page| &page.entries) {
+        states += u64::from(!matches!(entry, LinkEntry::Retired { .. }));
+        if let LinkEntry::DeadEnd { error_m, .. } = entry {
+            merges += 1;
+            sum_m += f64::from(*error_m);
+            worst_m = worst_m.max(*error_m);
+        }
+    }
+    let stats = &garment.stats;
+    let mean_m = sum_m / merges.max(1) as f64;
+    let worst = (f64::from(stats.worst_error_m), f64::from(worst_m));
+    let figures = [
+        ("states", stats.states as f64, states as f64, 0.0),
+        ("merges", stats.merges as f64, merges as f64, 0.0),
+        ("m of worst merge error", worst.0, worst.1, 0.0),
+        // A mean is summed in whatever order, and rounded.
+        ("m of mean merge error", f64::from(stats.mean_error_m), mean_m, 1e-6 * mean_m.max(1e-3)),
+    ];
+    for (what, stated, found, slack) in figures {
+        if (stated - found).abs() > slack {
+            let garment = garment.name.clone();
+            return Err(InspectError::Figure { garment, what, stated, found });
+        }
+    }
+    Ok(())
+}
+
 fn wrong(hash: ChunkHash, source: impl Into<ChunkError>) -> InspectError {
     InspectError::Chunk { hash, source: source.into() }
 }
@@ -293,4 +337,54 @@ fn same(
 
 fn sum(bytes: impl Iterator<Item = u32>) -> u64 {
     bytes.map(u64::from).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::manifest::ChunkRef;
+    use protocol::{GarmentId, PoseId};
+
+    #[test]
+    fn figures_that_are_not_those_of_the_links_are_refused() {
+        let dead = |error_m| LinkEntry::DeadEnd { pose: PoseId(0), target: StateId(0), error_m };
+        let entries = vec![
+            LinkEntry::Interior { pose: PoseId(0), next: vec![StateId(1)] },
+            dead(0.25),
+            dead(0.5),
+            LinkEntry::Retired { pose: PoseId(0), successor: StateId(0) },
+        ];
+        let pages = [LinkPage { first_state: StateId(0), entries }];
+        let stats = VersionStats {
+            states: 3,
+            merges: 2,
+            worst_error_m: 0.5,
+            mean_error_m: 0.375,
+            ..VersionStats::default()
+        };
+        let chunk = ChunkRef { hash: ChunkHash::of(b""), bytes: 0 };
+        let garment = |stats| GarmentVersion {
+            id: GarmentId(0),
+            name: "flag".into(),
+            codec: "toile".into(),
+            scene: chunk,
+            mesh: chunk,
+            generations: Vec::new(),
+            regions: Vec::new(),
+            links: Vec::new(),
+            stats,
+            upsampler: None,
+        };
+        check_figures(&garment(stats), &pages).unwrap();
+        let forged = [
+            ("states", VersionStats { states: 4, ..stats }),
+            ("merges", VersionStats { merges: 1, ..stats }),
+            ("worst", VersionStats { worst_error_m: 0.25, ..stats }),
+            ("mean", VersionStats { mean_error_m: 0.3, ..stats }),
+        ];
+        for (what, stats) in forged {
+            let error = check_figures(&garment(stats), &pages).unwrap_err().to_string();
+            assert!(error.contains(what), "{error}");
+        }
+    }
 }
