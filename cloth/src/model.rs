@@ -65,8 +65,8 @@ pub struct Model {
     pub(crate) environment: Environment,
     pub(crate) body: Option<Character>,
     pub(crate) attachments: Vec<Attachment>,
-    /// Where every vertex lies on the body in the rest pose; empty without a body.
-    pub(crate) homes: Vec<Attachment>,
+    /// Triangle of the body nearest to each vertex in the rest pose; empty without a body.
+    pub(crate) nearest: Vec<u32>,
     /// Edges between held vertices, with their rest lengths (m).
     pub(crate) held_edges: Vec<([u32; 2], f32)>,
     /// Vertex masses (kg).
@@ -152,6 +152,7 @@ impl Model {
         });
         let all: Vec<u32> = (0..count as u32).collect();
         let homes = if body.is_some() { attach(&mesh, body.as_ref(), &all) } else { Vec::new() };
+        let nearest = homes.iter().map(|home| home.triangle).collect();
         let pattern = Pattern::new(&mesh);
         let held = |v: u32| attached.binary_search(&v).is_ok();
         let edges = mesh.edges().iter().copied().zip(mesh.rest_lengths().iter().copied());
@@ -161,7 +162,7 @@ impl Model {
             masses: mesh.vertex_areas().iter().map(|a| a * material.density).collect(),
             bending: bending::Stiffness::new(&mesh, &pattern, material.bend),
             held_edges,
-            homes,
+            nearest,
             shares: Shares::new(&mesh, &pattern, held),
             tree: Tree::new(&mesh),
             layers: Vec::new(),

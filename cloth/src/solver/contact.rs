@@ -104,11 +104,6 @@ impl Near {
         self.found.then_some(self.triangle)
     }
 
-    /// Whether the vertex is inside one part of the body by more than `depth` (m).
-    pub(crate) fn is_deeper_than(&self, depth: f32) -> bool {
-        self.found && !self.pinched && self.distance < -depth
-    }
-
     /// Measures the distance to the plane again after the vertex moved to `point`.
     pub(crate) fn moved(&mut self, surface: &Surface, posed: &Posed, point: Vec3) {
         if self.found {
@@ -160,12 +155,6 @@ impl Row {
     pub(crate) fn ground(x: Vec3A, offset: f32) -> Self {
         let point = Vec3A::new(x.x, 0.0, x.z);
         Self { kind: Kind::Plane, normal: Vec3A::Y, point, travel: Vec3A::ZERO, offset }
-    }
-
-    /// Leads a vertex from `x` to its home, that moves from `from` to `to` during the substep.
-    pub(crate) fn home(x: Vec3A, from: Vec3A, to: Vec3A, dt: f32) -> Self {
-        let travel = to - from + (from - x).clamp_length_max(CORRECTION_M_S * dt);
-        Self { kind: Kind::Held, travel, ..Self::default() }
     }
 
     /// Asks for `offset`, or for less if the vertex began the substep at the signed distance

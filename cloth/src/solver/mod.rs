@@ -11,7 +11,6 @@ pub(crate) mod contact;
 pub(crate) mod limit;
 pub(crate) mod matrix;
 pub(crate) mod membrane;
-pub(crate) mod recover;
 pub(crate) mod self_contact;
 pub(crate) mod simd;
 pub mod track;
@@ -24,7 +23,6 @@ use crate::rigid::Rigid;
 use crate::surface::Posed;
 use contact::{Friction, Kind, Near, Row};
 use matrix::{Given, Matrix, Scratch, Stop};
-use recover::Recovery;
 use self_contact::SelfContact;
 
 /// Longest substep (s).
@@ -114,7 +112,6 @@ pub struct Workspace {
     held: Vec<bool>,
     inverse_masses: Vec<f32>,
     free: Vec<f32>,
-    recovery: Recovery,
     self_contact: SelfContact,
     busy: Vec<limit::Edge>,
     matrix: Matrix,
@@ -141,7 +138,6 @@ pub fn step(
     let dt = span.seconds / substeps as f32;
     let body_way = way / substeps as f32;
     ws.find_all(model, dt, body_way);
-    ws.recovery.mark(model, &ws.near, &ws.held);
     if model.environment.self_contact {
         ws.self_contact.find_tangles(model, &ws.x);
     }
@@ -229,8 +225,13 @@ impl Workspace {
         for (i, (x, v)) in self.x.iter().zip(&self.v).enumerate() {
             let reach = contact::reach(model.material.offset, v.length() * dt, body_way);
             let reach = reach.max(DEPTH_FOUND_M);
-            let home = model.homes.get(i).map(|home| home.triangle);
-            self.near.push(Near::find(model, &self.from, (*x).into(), reach, home));
+            self.near.push(Near::find(
+                model,
+                &self.from,
+                (*x).into(),
+                reach,
+                model.nearest.get(i).copied(),
+            ));
         }
     }
 
@@ -281,12 +282,6 @@ impl Workspace {
                 let near = &self.near[i];
                 row = near.carried(&c.surface, &self.from, &self.to);
                 row = row.keep(offset, near.distance, dt);
-                if self.recovery.led[i] {
-                    let home = &model.homes[i];
-                    let from = home.place(&c.surface, &self.from).into();
-                    let to = home.place(&c.surface, &self.to).into();
-                    row = Row::home(self.x[i], from, to, dt);
-                }
             }
             self.rows[i] = if meets(&row, ahead) { row } else { Row::default() };
             self.ground[i] = ground_row(model, ahead, 0.0);
@@ -301,9 +296,6 @@ impl Workspace {
             self.loads[i] = [self.rows[i].load(at), self.ground[i].load(at)];
             self.ground[i] = ground_row(model, at, self.dx[i].length() + NEAR_M);
             let Some(c) = &model.body else { continue };
-            if self.recovery.led[i] {
-                continue;
-            }
             let reach = contact::reach(offset, self.dx[i].length(), body_way);
             let start = if self.near[i].found { self.near[i].distance } else { offset };
             let inside = (-start).max(0.0);

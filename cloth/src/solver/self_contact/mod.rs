@@ -20,7 +20,7 @@
 //! Where the cloth crosses itself already, the pairs all of whose vertices belong to edges and
 //! triangles that cut each other may pass, and those with one such vertex do not repel, so that
 //! `untangle` can work there and what is whole around stays so. Vertices that are held between
-//! body parts or led home keep off other cloth as all do: layers that are pressed between an arm
+//! body parts keep off other cloth as all do: layers that are pressed between an arm
 //! and the chest stay apart in the middle, and are in order when they come free. Of two layers in the
 //! wrong order the outer one is led through the inner one, at a bounded speed.
 
