@@ -125,7 +125,8 @@ pub struct Explore {
     /// Stop when the store holds this many simulated frames.
     #[arg(long)]
     pub frames: Option<u64>,
-    /// Stop when no merge is worse than this (mm).
+    /// Stop when the best prefix has no merge that costs more than this (mm): its error, and the
+    /// scene's penalty where it crosses classes.
     #[arg(long, value_name = "MM", allow_negative_numbers = true)]
     pub error: Option<f32>,
     /// Stop after this long, e.g. 60s, 5m.

@@ -7,7 +7,7 @@ use explorer::certificate::{Bifurcation, Certificate, Replay, certify, replay};
 use explorer::faults::{Flagged, flagged};
 use explorer::pack::inspect::{GarmentInspection, inspect};
 use explorer::pipe::simulators;
-use explorer::telemetry::walked_since;
+use explorer::telemetry::walked_ever;
 use serde::Serialize;
 
 use crate::live::Live;
@@ -61,7 +61,7 @@ pub fn run(a: &args::Inspect) -> Result<()> {
         if wanted {
             let explored = recall(&opened, &a.explored)?;
             let walked =
-                runtime.block_on(walked_since(&*opened.store, explorer::FIRST_GARMENT, 0))?.counts;
+                runtime.block_on(walked_ever(&*opened.store, explorer::FIRST_GARMENT))?.counts;
             let archive = &explored.archive;
             let certificate = certify(archive, &explored.scene, archive.shown(), &walked);
             agree(&explored, &certificate, found.version.0, garment)?;

@@ -51,7 +51,7 @@ fn run() -> Result<bool, String> {
     let scene = scene.map_err(|e| e.to_string())?;
     let mut simulator = ClothSimulator::new(&scene).map_err(|e| e.0)?;
     let begun = Instant::now();
-    let draped = simulator.drape().map_err(|e| e.0)?;
+    let draped = simulator.drape(&|| false).map_err(|e| e.0)?;
     println!("drape {:.1} s, {:?}", begun.elapsed().as_secs_f32(), draped.quality);
     let mut pass = Pass::default();
     walk(&scene, &mut simulator, &draped.state, (limit, &clips), &mut pass);

@@ -31,7 +31,7 @@ fn main() -> Result<(), String> {
     let scene = scene.map_err(|e| e.to_string())?;
     let mut simulator = ClothSimulator::new(&scene).map_err(|e| e.0)?;
     let begun = cpu_s();
-    let draped = simulator.drape().map_err(|e| e.0)?;
+    let draped = simulator.drape(&|| false).map_err(|e| e.0)?;
     println!("drape {:.2} s", cpu_s() - begun);
     let clips = if clips.is_empty() { scene.primary.clips().to_vec() } else { clips };
     for clip in &clips {

@@ -48,6 +48,8 @@ pub struct Merge {
     pub target_class: String,
     /// What the queue adds for crossing classes (mm).
     pub penalty_mm: f64,
+    /// Whether the target's frame came out of bounds: such a merge is undone before any other.
+    pub into_flagged: bool,
     /// Share of a player's frames that end in this merge.
     pub visits: f64,
     /// Traversals of its edge that players reported.
@@ -100,13 +102,16 @@ pub fn certify(
     let view = archive.view(commit);
     let graph = archive.graph();
     let visits = visits_at(graph, commit, archive.ledger().steering().model(), &[]);
+    let penalties = class::Penalties::new(&scene.metric.classes);
     let mut merges = Vec::new();
     for id in (0..view.state_count()).map(StateId) {
         let KindAt::DeadEnd(target, error_m) = view.kind(id) else { continue };
         let state = graph.state(id);
         let pose = graph.primary().pose(state.pose);
         let edge = state.parent.expect("a dead end was simulated from somewhere").1;
-        let class = |id: StateId| class::name(&scene.metric.classes, graph.state(id).class);
+        let named = |id: StateId| class::name(&scene.metric.classes, graph.state(id).class);
+        let led_into = graph.state(target).class;
+        let penalty_m = penalties.of(state.class, led_into & !class::FLAGGED);
         merges.push(Merge {
             state: id.0,
             pose: state.pose.0,
@@ -116,9 +121,10 @@ pub fn certify(
             edge: edge.0,
             target: target.0,
             error_mm: 1e3 * f64::from(error_m),
-            class: class(id),
-            target_class: class(target),
-            penalty_mm: 1e3 * f64::from(graph.penalty_m(id, target)),
+            class: named(id),
+            target_class: named(target),
+            penalty_mm: 1e3 * f64::from(penalty_m),
+            into_flagged: led_into & class::FLAGGED != 0,
             visits: visits[id.index()],
             walked: walked.get(&edge).copied().unwrap_or(0),
         });

@@ -122,9 +122,9 @@ impl ClothSimulator {
         let (from, to) = (from.moved(&home), to.moved(&home));
         let nudge = std::mem::take(&mut self.nudge);
         let body_speed_m_s = self.body_speed(&from, &to, seconds);
-        let (mut failed, mut kept, mut before) = (String::new(), None, None::<Fault>);
+        let (mut failed, mut attempts) = (String::new(), Attempts::default());
         let (mut substeps, mut iterations) = (0, 0);
-        for (attempt, finer) in watchdog::REFINE.into_iter().enumerate() {
+        for finer in watchdog::REFINE {
             let mut world = to_world(state, &from.hips());
             world.positions.iter_mut().for_each(|p| *p += nudge);
             let refine = self.refine * finer;
@@ -137,10 +137,11 @@ impl ClothSimulator {
                 }
                 Err(e) => Err(e.to_string()),
             };
-            let mut frame = match moved {
+            let frame = match moved {
                 Ok(state) => self.measured(state, &to),
                 Err(why) => {
                     failed = why;
+                    attempts.fail();
                     continue;
                 }
             };
@@ -151,17 +152,12 @@ impl ClothSimulator {
                 && crossings > self.crossings_of(state);
             let fault = Fault::of(&frame.quality, body_speed_m_s)
                 .or(is_new.then_some(Fault::Crossings(crossings)));
-            frame.quality.frames_retried = u64::from(attempt > 0);
-            frame.quality.frames_flagged = u64::from(fault.is_some());
-            kept = Some(frame);
-            let resists = fault.zip(before).is_some_and(|(now, before)| now.resists(&before));
-            if fault.is_none() || resists {
+            if attempts.is_enough(frame, fault) {
                 break;
             }
-            before = fault;
         }
         let text = || format!("the cloth left its bounds, also at a quarter step: {failed}");
-        let mut frame = kept.ok_or_else(|| SimulateError(text()))?;
+        let mut frame = attempts.best().ok_or_else(|| SimulateError(text()))?;
         (frame.quality.substeps, frame.quality.iterations) = (substeps, iterations);
         Ok(frame)
     }
@@ -256,6 +252,44 @@ impl ClothSimulator {
     }
 }
 
+/// Attempts at a frame, and the best of them.
+#[derive(Default)]
+struct Attempts {
+    count: u32,
+    /// Fault of the last attempt that came to an end.
+    last: Option<Fault>,
+    best: Option<(Frame, Option<Fault>)>,
+}
+
+impl Attempts {
+    /// One that could not be kept.
+    fn fail(&mut self) {
+        self.count += 1;
+    }
+
+    /// One that came to an end; says whether no other is worth its cost.
+    fn is_enough(&mut self, frame: Frame, fault: Option<Fault>) -> bool {
+        self.count += 1;
+        let is_better = match (&self.best, fault) {
+            (None, _) | (_, None) => true,
+            (Some((_, best)), Some(now)) => best.is_some_and(|best| now.is_less_than(&best)),
+        };
+        if is_better {
+            self.best = Some((frame, fault));
+        }
+        let last = std::mem::replace(&mut self.last, fault);
+        fault.zip(last).map_or(fault.is_none(), |(now, last)| now.resists(&last))
+    }
+
+    /// The best, which says what became of all.
+    fn best(self) -> Option<Frame> {
+        let (mut frame, fault) = self.best?;
+        frame.quality.frames_retried = u64::from(self.count > 1);
+        frame.quality.frames_flagged = u64::from(fault.is_some());
+        Some(frame)
+    }
+}
+
 impl Simulator for ClothSimulator {
     fn step(&mut self, state: &GridState, edge: EdgeId) -> Result<Frame, SimulateError> {
         let scene = self.scene.clone();
@@ -266,7 +300,7 @@ impl Simulator for ClothSimulator {
             .map_err(|e| SimulateError(format!("pose {} to pose {}: {e}", edge.from, edge.to)))
     }
 
-    fn drape(&mut self) -> Result<Frame, SimulateError> {
+    fn drape(&mut self, should_stop: &dyn Fn() -> bool) -> Result<Frame, SimulateError> {
         self.check_rest()?;
         let scene = self.scene.clone();
         let rest = scene.body.skeleton.rest_pose();
@@ -280,7 +314,10 @@ impl Simulator for ClothSimulator {
         let mut state = to_grid(&state, &rest.hips()).map_err(|e| SimulateError(e.to_string()))?;
         let mut from = rest.clone();
         let mut quality = FrameQuality::default();
-        for frame in 1..=2 * frames {
+        for frame in 1..=2 * u64::from(frames) {
+            if should_stop() {
+                return Err(SimulateError("the drape was stopped".to_owned()));
+            }
             let t = (frame as f32 / frames as f32).min(1.0);
             let to = rest.interpolate(start, t * t * (3.0 - 2.0 * t));
             let moved = self
@@ -306,4 +343,57 @@ pub(crate) fn to_grid(world: &State, hips: &Rigid) -> Result<GridState, crate::g
     let positions: Vec<Vec3> = world.positions.iter().map(|p| inverse.point(*p)).collect();
     let velocities: Vec<Vec3> = world.velocities.iter().map(|v| inverse.vector(*v)).collect();
     GridState::round(&positions, &velocities)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(mark: i16) -> Frame {
+        let state = GridState { positions: vec![[mark; 3]], velocities: vec![[0; 3]] };
+        Frame { state, quality: FrameQuality { frames: 1, ..FrameQuality::default() } }
+    }
+
+    /// What is kept: its mark, whether it counts as retried, whether as flagged.
+    fn kept(attempts: Attempts) -> Option<(i16, u64, u64)> {
+        let Frame { state, quality } = attempts.best()?;
+        Some((state.positions[0][0], quality.frames_retried, quality.frames_flagged))
+    }
+
+    #[test]
+    fn the_best_attempt_is_kept_and_every_retry_counts() {
+        let mut sound = Attempts::default();
+        assert!(sound.is_enough(frame(1), None));
+        assert_eq!(kept(sound), Some((1, 0, 0)));
+        let mut healed = Attempts::default();
+        assert!(!healed.is_enough(frame(1), Some(Fault::Strain(0.2))));
+        assert!(healed.is_enough(frame(2), None));
+        assert_eq!(kept(healed), Some((2, 1, 0)));
+        let mut alone = Attempts::default();
+        assert!(!alone.is_enough(frame(1), Some(Fault::Strain(0.2))));
+        alone.fail();
+        alone.fail();
+        assert_eq!(kept(alone), Some((1, 1, 1)), "finer steps failed, and were tried");
+        let mut worse = Attempts::default();
+        assert!(!worse.is_enough(frame(1), Some(Fault::Deep(0.010))));
+        assert!(worse.is_enough(frame(2), Some(Fault::Deep(0.020))), "it resists");
+        assert_eq!(kept(worse), Some((1, 1, 1)), "the better of two that are at fault");
+        let mut less = Attempts::default();
+        assert!(!less.is_enough(frame(1), Some(Fault::Speed(30.0))));
+        assert!(!less.is_enough(frame(2), Some(Fault::Crossings(4))));
+        assert!(less.is_enough(frame(3), Some(Fault::Crossings(3))));
+        assert_eq!(kept(less), Some((3, 1, 1)));
+        let mut none = Attempts::default();
+        none.fail();
+        assert_eq!(kept(none), None);
+    }
+
+    #[test]
+    fn a_drape_ends_where_it_is_to_stop() {
+        let scene = crate::builtin::robe(Some(1500)).unwrap();
+        let asked = std::cell::Cell::new(0);
+        let should_stop = || asked.replace(asked.get() + 1) == 1;
+        let error = ClothSimulator::new(&scene).unwrap().drape(&should_stop).unwrap_err();
+        assert_eq!((error.to_string().as_str(), asked.get()), ("the drape was stopped", 2));
+    }
 }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use object_store::ObjectStore;
 use protocol::manifest::GarmentVersion;
-use protocol::{SigningKey, VersionNumber};
+use protocol::{SigningKey, StateId, VersionNumber};
 
 use crate::cpu::CpuClock;
 use crate::disk::free_bytes;
@@ -28,6 +28,8 @@ use crate::tags::{Tagged, tagged_since};
 use crate::telemetry::{Walked, walked_since};
 use crate::view::GraphView;
 
+#[path = "explore_physics.rs"]
+mod physics;
 #[path = "explore_report.rs"]
 mod report;
 
@@ -45,7 +47,8 @@ pub struct ExploreOptions {
     /// Ends after the job with which the store's graph has this many simulated frames, the drape
     /// apart, once the initial pass is over.
     pub frames: Option<u64>,
-    /// Ends once the best prefix's worst merge error is at most this (m).
+    /// Ends once the best prefix's worst merge costs at most this (m): its error, and the penalty
+    /// where it crosses classes or leads into a flagged state.
     pub error_m: Option<f32>,
     /// Which dead ends are simulated first. Taken up at the next round, whatever it was before.
     pub policy: Policy,
@@ -109,6 +112,20 @@ pub enum ExploreError {
     /// A clip that is not there.
     #[error("there is no clip {0:?} to explore in; the scene has {1}")]
     NoClip(String, String),
+    /// What was simulated before does not come out again.
+    #[error(
+        "the work folder {}: state {state}, simulated again, comes out {apart_mm:.3} mm from the one on \
+         record: another simulator made this folder; take that one, or another work folder and store",
+        .folder.display()
+    )]
+    OtherPhysics {
+        /// The work folder.
+        folder: PathBuf,
+        /// The state at the frame's end.
+        state: StateId,
+        /// How far the two are apart by the scene's metric (mm).
+        apart_mm: f32,
+    },
     /// The garment could not be draped on the start pose.
     #[error("draping the garment: {0}")]
     Drape(SimulateError),
@@ -165,7 +182,8 @@ pub struct Place {
 ///
 /// # Errors
 /// The work folder or the store refuses, or the initial pass cannot be simulated. A job of an
-/// expansion that cannot be simulated is no error: see [`Progress::failure`].
+/// expansion that cannot be simulated is no error (see [`Progress::failure`]), unless nothing can be
+/// any more. Another simulator than the one that made the folder is refused.
 pub async fn explore(
     scene: &Scene,
     simulators: &dyn SimulatorFactory,
@@ -313,20 +331,20 @@ async fn run(
     let (head, stored) = publisher.head();
     let known = work.graph().next_id().0;
     if stored > known {
-        let folder = setup.work.to_owned();
-        return Err(ExploreError::StoreAhead { stored, folder, known });
+        return Err(ExploreError::StoreAhead { stored, folder: setup.work.to_owned(), known });
     }
     let clips = clips(scene, &options.clips)?;
-    let first = work.graph().next_id().0;
-    let mut run = Run { start: Instant::now(), first, drape_cpu_s: 0.0, seen_mm_per_s: None };
+    let mut run = Run::new(known);
     let workers = options.workers.clamp(1, WORKERS_MAX);
     let mut simulators: Vec<Box<dyn Simulator>> =
         (0..workers).map(|_| setup.simulators.simulator()).collect();
     // A store that lost versions, or a new one for an old folder, is brought up to date at once.
     let mut behind = work.ledger().published().is_some_and(|p| head < Some(p.number))
         || publisher.lacks_upsampler();
+    physics::check(&setup, &work, simulators[0].as_mut())?;
     let stop = || (options.should_stop)();
     let mut paused = Paused::default();
+    let mut second_chance = true;
     progress(&run.progress(&setup, &work, None));
     loop {
         if frames_reached_in_round(&work, options) {
@@ -343,14 +361,11 @@ async fn run(
             if let Some(end) = ended.await? {
                 return finish(&setup, work, &run, publisher, end).await;
             }
-            if stop() {
-                return Ok(run.summary(&setup, &work, End::Stopped));
-            }
-            if disk_is_nearly_full(&setup, &work) {
-                return Ok(run.summary(&setup, &work, End::Disk));
+            if let Some(end) = must_end(&setup, &work) {
+                return Ok(run.summary(&setup, &work, end));
             }
             steer(&mut work, publisher, options.policy, &clips).await?;
-            if !work.open_round() {
+            if !open_round(&mut work, &mut second_chance)? {
                 return finish(&setup, work, &run, publisher, End::Exhausted).await;
             }
         }
@@ -361,7 +376,9 @@ async fn run(
         let asks = (&stop as &dyn Fn() -> bool, tags);
         let ended =
             round::run(&mut work, &mut simulators, &mut paused, asks, options.frames, &mut each);
-        match ended.await? {
+        let ended = ended.await?;
+        run.program_cpu_s = simulators.iter().map(|simulator| simulator.program_cpu_s()).sum();
+        match ended {
             // The next look ends it.
             Ended::Done | Ended::Frames => {}
             Ended::Stopped => return Ok(run.summary(&setup, &work, End::Stopped)),
@@ -401,13 +418,19 @@ async fn between_rounds(
     progress: &mut dyn FnMut(&Progress),
 ) -> Result<Option<End>, ExploreError> {
     if work.ledger().phase() == Phase::Drape {
+        let stop = || (setup.options.should_stop)();
         let clock = CpuClock::start();
-        let mut frame = simulator.drape();
-        if frame.is_err() && simulator.may_recover() {
-            frame = simulator.drape();
+        let mut frame = simulator.drape(&stop);
+        if frame.is_err() && simulator.may_recover() && !stop() {
+            frame = simulator.drape(&stop);
         }
-        let frame = frame.map_err(ExploreError::Drape)?;
-        run.drape_cpu_s = clock.elapsed_s();
+        run.program_cpu_s = simulator.program_cpu_s();
+        let frame = match frame {
+            // The next look ends it.
+            Err(_) if stop() => return Ok(None),
+            frame => frame.map_err(ExploreError::Drape)?,
+        };
+        run.drape_cpu_s = clock.elapsed_s() + run.program_cpu_s;
         work.drape(&frame)?;
         progress(&run.progress(setup, work, None));
     }
@@ -471,6 +494,20 @@ async fn steer(
         work.tag(TagRecord { newest, states })?;
     }
     Ok(())
+}
+
+/// Whether to end without another round, and without a version.
+fn must_end(setup: &Setup<'_>, work: &Work) -> Option<End> {
+    if (setup.options.should_stop)() {
+        return Some(End::Stopped);
+    }
+    disk_is_nearly_full(setup, work).then_some(End::Disk)
+}
+
+/// Opens the next round. Once in a run that may be of dead ends that were set aside: a program that was
+/// mended meanwhile does what it could not.
+fn open_round(work: &mut Work, second_chance: &mut bool) -> Result<bool, WorkError> {
+    Ok(work.open_round() || std::mem::take(second_chance) && work.reconsider()?)
 }
 
 fn disk_is_nearly_full(setup: &Setup<'_>, work: &Work) -> bool {

@@ -32,17 +32,19 @@ pub struct Progress {
     pub queued: u64,
     /// Largest merge error (m).
     pub worst_error_m: f32,
-    /// Lowest worst merge error so far (m), once there is a whole graph.
+    /// Worst merge error of the best prefix, the one whose worst merge costs least (m), once there is
+    /// a whole graph.
     pub best_worst_error_m: Option<f32>,
     /// Mean merge error (m).
     pub mean_error_m: f32,
     /// The newest version published from this work folder.
     pub version: Option<VersionNumber>,
-    /// Jobs given up; their dead ends are set aside.
+    /// Jobs given up over all runs; their dead ends are set aside.
     pub failed_jobs: u64,
     /// Measures of all frames, the drape's included.
     pub quality: FrameQuality,
-    /// CPU seconds of jobs (wall seconds where the system does not tell), over all runs.
+    /// CPU seconds of jobs, dropped ones and a foreign program's included (wall seconds where the
+    /// system does not tell), over all runs.
     pub simulate_cpu_s: f64,
     /// What players see of merges in a second of play, by the counts that had arrived when the newest version
     /// of this run was published (mm): the errors of the merges that they pass, summed.
@@ -97,18 +99,24 @@ pub struct Summary {
     pub merges: u64,
     /// Largest merge error (mm).
     pub worst_error_mm: f64,
-    /// Lowest worst merge error since the initial pass (mm).
+    /// Worst merge error of the best prefix, the one whose worst merge costs least (mm).
     pub best_worst_error_mm: f64,
+    /// The least that the worst merge ever cost since the initial pass (mm): its error, and the
+    /// penalty where it crosses classes or leads into a flagged state. What `--error` goes by.
+    pub best_worst_cost_mm: f64,
     /// Mean merge error (mm).
     pub mean_error_mm: f64,
     /// Frames simulated, drape apart.
     pub simulated_frames: u64,
-    /// CPU seconds of jobs (wall seconds where the system does not tell), over all runs.
+    /// CPU seconds of jobs, dropped ones and a foreign program's included (wall seconds where the
+    /// system does not tell), over all runs.
     pub simulate_cpu_s: f64,
     /// The newest version published; 0 for none.
     pub version: u64,
-    /// Jobs given up.
+    /// Jobs given up over all runs.
     pub failed_jobs: u64,
+    /// Dead ends that stay merged since the last job from them was given up.
+    pub set_aside: u64,
     /// Frames that were simulated again at a finer step.
     pub frames_retried: u64,
     /// Frames that came out of bounds all the same.
@@ -123,7 +131,8 @@ pub struct Summary {
     pub merges_across_classes: u64,
     /// Of these, the ones that are implausible by the scene's rules.
     pub implausible_merges: u64,
-    /// CPU seconds of this process so far (wall seconds where the system does not tell).
+    /// CPU seconds so far of this process (wall seconds where the system does not tell) and of the
+    /// programs that simulated for it.
     pub cpu_s: f64,
     /// Frames simulated in this run, by second of its wall time.
     pub frames_per_wall_s: f64,
@@ -157,9 +166,17 @@ pub(super) struct Run {
     pub drape_cpu_s: f64,
     /// See [`Progress::seen_mm_per_s`].
     pub seen_mm_per_s: Option<f64>,
+    /// CPU seconds of programs that simulate.
+    pub program_cpu_s: f64,
 }
 
 impl Run {
+    /// One that begins now, where there are so many states.
+    pub fn new(states: u64) -> Self {
+        let start = Instant::now();
+        Self { start, first: states, drape_cpu_s: 0.0, seen_mm_per_s: None, program_cpu_s: 0.0 }
+    }
+
     /// Looks at what players see, for a version that was just published.
     pub fn published(&mut self, work: &Work) {
         let [_, mean_mm, merges_per_s] = visited(work);
@@ -178,7 +195,7 @@ impl Run {
             best_worst_error_m: graph.best_worst_error_m(),
             mean_error_m: graph.mean_error_m(),
             version: ledger.published().map(|last| last.number),
-            failed_jobs: ledger.set_aside().len() as u64,
+            failed_jobs: ledger.failed_jobs(),
             quality: *ledger.quality(),
             simulate_cpu_s: work.simulate_cpu_s(),
             seen_mm_per_s: self.seen_mm_per_s,
@@ -189,7 +206,7 @@ impl Run {
 
     fn cost(&self, setup: &Setup<'_>, work: &Work) -> FrameCost {
         let frames = work.graph().simulated_frames();
-        let drape_frames = 2 * setup.scene.exploration.drape_frames.max(1);
+        let drape_frames = setup.scene.exploration.drape_frames.max(1).saturating_mul(2);
         let cpu_s = match frames {
             0 => self.drape_cpu_s / f64::from(drape_frames),
             frames => work.simulate_cpu_s() / frames as f64,
@@ -230,11 +247,13 @@ impl Run {
             merges: graph.queue().len() as u64,
             worst_error_mm: millimetres(graph.worst_error_m()),
             best_worst_error_mm: millimetres(graph.best_worst_error_m().unwrap_or(0.0)),
+            best_worst_cost_mm: millimetres(graph.best_worst_cost_m().unwrap_or(0.0)),
             mean_error_mm: millimetres(graph.mean_error_m()),
             simulated_frames: graph.simulated_frames(),
             simulate_cpu_s: work.simulate_cpu_s(),
             version: ledger.published().map_or(0, |last| last.number.0),
-            failed_jobs: ledger.set_aside().len() as u64,
+            failed_jobs: ledger.failed_jobs(),
+            set_aside: ledger.set_aside().len() as u64,
             frames_retried: ledger.quality().frames_retried,
             frames_flagged: ledger.quality().frames_flagged,
             policy: setup.options.policy,
@@ -242,7 +261,7 @@ impl Run {
             merges_across_classes: graph.states().filter(|s| crossed(s)).count() as u64,
             implausible_merges: graph.states().filter(|s| implausible(s)).count() as u64,
             merges_into_flagged,
-            cpu_s: process_cpu_s().unwrap_or(wall_s),
+            cpu_s: process_cpu_s().unwrap_or(wall_s) + self.program_cpu_s,
             frames_per_wall_s: frames as f64 / wall_s.max(1e-9),
             visited_p95_mm,
             visited_mean_mm,

@@ -233,6 +233,7 @@ fn implausible_merges_are_undone_first_and_errors_stay_free_of_the_penalty() {
         };
         let merges: Vec<_> = certificate.merges.iter().filter(crossing).collect();
         assert!(merges.iter().all(|m| m.penalty_mm == f64::from(penalty_m) * 1e3));
+        assert!(summary.best_worst_cost_mm >= summary.best_worst_error_mm);
         assert!(certificate.bifurcations.iter().all(|b| b.from != b.to));
         assert!(certificate.bifurcations.iter().any(|b| b.crossings > 0 && !b.walks.is_empty()));
         if penalty_m > 0.0 {
@@ -241,6 +242,66 @@ fn implausible_merges_are_undone_first_and_errors_stay_free_of_the_penalty() {
         found.push(merges.len());
     }
     assert!(found[1] <= found[0], "{found:?}");
+}
+
+/// A merge into a flagged state says so, and its penalty is that of its classes alone.
+#[test]
+fn the_flag_is_no_penalty_of_a_class() {
+    let (scene, mut found) = (toy_scene(), 0);
+    for edge in 0..scene.primary.edges().len() as u32 {
+        // By this much the first frame of all comes out on an odd place, which is pose 1's only state.
+        let toy = Toy { doubtful: Some(EdgeId(edge)), ..Toy::new(150) };
+        let folder = tempfile::tempdir().unwrap();
+        let place = (folder.path(), &mut Memory::default());
+        let summary = explore(&scene, &toy, place, &options(1)).unwrap();
+        let archive = Archive::open(folder.path(), &scene).unwrap();
+        let certificate = certify(&archive, &scene, archive.graph().commit(), &[].into());
+        assert!(certificate.merges.iter().all(|m| m.penalty_mm == 0.0));
+        let into_flagged = certificate.merges.iter().filter(|m| m.into_flagged).count() as u64;
+        assert_eq!(into_flagged, summary.merges_into_flagged);
+        assert!(into_flagged == 0 || summary.best_worst_cost_mm > 1e5);
+        found += into_flagged;
+    }
+    assert!(found > 0, "the toy must flag a pose's only state");
+}
+
+/// Two long ways that part and meet: what the computed visits say is what a long walk meets.
+#[test]
+fn visits_are_what_a_long_random_walk_meets() {
+    let (short, long) = (40, 53);
+    let mut edges: Vec<(u32, u32)> = (0..short + long).map(|p| (p, p + 1)).collect();
+    edges.extend([(short, 0), (0, short + 1), (short + long, 0)]);
+    edges.retain(|way| *way != (short, short + 1));
+    edges.sort_unstable();
+    let mut scene = toy_scene();
+    scene.primary = std::sync::Arc::new(toy::primary(short + long + 1, &edges));
+    scene.exploration.depth_frames = 30;
+    let folder = tempfile::tempdir().unwrap();
+    let place = (folder.path(), &mut Memory::default());
+    explore(&scene, &Toy::new(252), place, &options(3000)).unwrap();
+    let archive = Archive::open(folder.path(), &scene).unwrap();
+    let graph = archive.graph();
+    let visits = visits(graph, &WalkModel::uniform(&scene.primary), &[]);
+    let mut random = rand_pcg::Pcg64Mcg::seed_from_u64(5);
+    let (mut met, mut at, steps) = (vec![0u32; visits.len()], StateId(0), 6_000_000);
+    for _ in 0..steps {
+        let ways: Vec<EdgeId> = scene.primary.out_edges(graph.state(at).pose).collect();
+        let slot = (random.next_u64() % ways.len() as u64) as usize;
+        let (edge, next) = (ways[slot], graph.next(at).get(slot).unwrap());
+        if matches!(graph.state(next).kind, Kind::DeadEnd { .. }) {
+            met[next.index()] += 1;
+        }
+        at = graph.follow(at, edge).unwrap();
+    }
+    let (mut sum, mut sum_met) = (0.0, 0.0);
+    for (state, _) in graph.queue().iter() {
+        let (expected, met) = (visits[state.index()], f64::from(met[state.index()]) / 6e6);
+        let worst = 0.05 * expected + 3e-5;
+        assert!((expected - met).abs() < worst, "{state}: {expected} computed, {met} met");
+        (sum, sum_met) = (sum + expected, sum_met + met);
+    }
+    println!("{} states: {sum} merges a frame computed, {sum_met} met", graph.states().len());
+    assert!((sum / sum_met - 1.0).abs() < 0.01, "{sum} computed, {sum_met} met");
 }
 
 /// The error that players of this model see on average (m).
@@ -382,13 +443,23 @@ fn measure_search(work: &Work, states: u64) {
         assert!(found.unwrap().is_some());
         among += known.len() as u64;
     }
+    let search_ms = clock.elapsed().as_secs_f64() * 1e3 / searches as f64;
+    let (look, model) = (Instant::now(), WalkModel::uniform(work.graph().primary()));
+    let cold = visits(work.graph(), &model, &[]);
+    let cold_s = look.elapsed().as_secs_f64();
+    let again = visits(work.graph(), &model, &cold[..cold.len() * 49 / 50]);
+    let apart: f64 = cold.iter().zip(&again).map(|(a, b)| (a - b).abs()).sum();
+    println!(
+        "  visits in {cold_s:.3} s, in {:.3} s from those of 98 % of the states, {apart:.1e} apart",
+        look.elapsed().as_secs_f64() - cold_s
+    );
     let [now, peak] = ["VmRSS:", "VmHWM:"].map(memory_mb);
     println!(
         "  {} bytes of journal; a search at a place taken at random, among {}: {:.2} ms; memory {now:.0} MB \
          (peak {peak:.0}), {:.1} of it landmarks",
         work.journal().bytes(),
         among / searches,
-        clock.elapsed().as_secs_f64() * 1e3 / searches as f64,
+        search_ms,
         work.similar().landmark_bytes() as f64 / 1e6,
     );
 }
@@ -432,7 +503,7 @@ impl Simulator for Wide {
         Ok(Frame { state: next, quality })
     }
 
-    fn drape(&mut self) -> Result<Frame, SimulateError> {
+    fn drape(&mut self, _should_stop: &dyn Fn() -> bool) -> Result<Frame, SimulateError> {
         let state = GridState { positions: vec![[0; 3]; self.0], velocities: vec![[0; 3]; self.0] };
         Ok(Frame { state, quality: FrameQuality::default() })
     }

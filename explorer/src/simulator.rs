@@ -20,12 +20,24 @@ pub trait Simulator: Send {
         false
     }
 
+    /// Whether the last step failed whatever it was: a program that cannot be started, or that
+    /// ended before it answered anything.
+    fn is_out_of_order(&self) -> bool {
+        false
+    }
+
+    /// CPU time so far outside of the threads that asked (s): of a program, as far as the system
+    /// tells; where it does not, the time that was waited for it.
+    fn program_cpu_s(&self) -> f64 {
+        0.0
+    }
+
     /// The garment draped on the start pose: checked against the body in the rest pose, brought
-    /// to the start pose over some frames, settled.
+    /// to the start pose over some frames, settled. `should_stop` is asked before every frame.
     ///
     /// # Errors
-    /// As for `step`.
-    fn drape(&mut self) -> Result<Frame, SimulateError>;
+    /// As for `step`; also where it was to stop.
+    fn drape(&mut self, should_stop: &dyn Fn() -> bool) -> Result<Frame, SimulateError>;
 }
 
 /// A simulated frame.

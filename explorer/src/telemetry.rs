@@ -9,6 +9,8 @@ use protocol::{EdgeId, GarmentId, limits, store};
 
 /// Batches read at once: a store that collected for a month is not read from its beginning.
 const BATCHES_MAX: u64 = 360;
+/// Batches that [`walked_ever`] reads: of a store that collected for longer, the newest.
+const EVER_BATCHES_MAX: u64 = 100_000;
 
 /// Counts of one garment's edges, and the newest batch they come from.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -33,7 +35,31 @@ pub async fn walked_since(
     if after == 0 {
         walked.newest = newest(from).await?.saturating_sub(BATCHES_MAX);
     }
-    for number in walked.newest + 1..=walked.newest + BATCHES_MAX {
+    read(from, garment, BATCHES_MAX, walked).await
+}
+
+/// Reads all batches of one garment there are, the newest 100,000 at most. One that cannot be understood is
+/// passed over.
+///
+/// # Errors
+/// The store cannot be read.
+pub async fn walked_ever(
+    from: &dyn ObjectStore,
+    garment: GarmentId,
+) -> Result<Walked, object_store::Error> {
+    let before = newest(from).await?.saturating_sub(EVER_BATCHES_MAX);
+    let walked = Walked { newest: before, ..Walked::default() };
+    read(from, garment, EVER_BATCHES_MAX, walked).await
+}
+
+/// Adds the batches behind the newest one of `walked`, at most so many.
+async fn read(
+    from: &dyn ObjectStore,
+    garment: GarmentId,
+    most: u64,
+    mut walked: Walked,
+) -> Result<Walked, object_store::Error> {
+    for number in walked.newest + 1..=walked.newest + most {
         let bytes = match from.get(&Path::from(store::telemetry_path(number))).await {
             Ok(found) if found.meta.size <= limits::CHUNK_BYTES_MAX as u64 => found.bytes().await?,
             Ok(_) => Default::default(),
@@ -88,6 +114,15 @@ mod tests {
         assert_eq!((all.newest, all.counts[&EdgeId(3)], all.counts[&EdgeId(9)]), (4, u64::MAX, 2));
         let rest = walked_since(&memory, GarmentId(1), 2).await.unwrap();
         assert_eq!((rest.newest, rest.counts.len()), (4, 0));
+        // A certificate tells of all that players walked, not of the last hour.
+        for number in 5..=500 {
+            let path = Path::from(store::telemetry_path(number));
+            memory.put(&path, batch(1, 1).into()).await.unwrap();
+        }
+        let recent = walked_since(&memory, GarmentId(1), 0).await.unwrap();
+        let ever = walked_ever(&memory, GarmentId(1)).await.unwrap();
+        assert_eq!((recent.newest, recent.counts[&EdgeId(3)]), (500, BATCHES_MAX));
+        assert_eq!((ever.newest, ever.counts[&EdgeId(3)]), (500, 100 + 496));
         let nothing = walked_since(&InMemory::new(), GarmentId(0), 0).await.unwrap();
         assert_eq!(nothing, Walked::default());
     }

@@ -52,6 +52,18 @@ impl Fault {
         }
     }
 
+    /// Whether this is the lesser of two: a fault that is looked for later, since those before it
+    /// are gone, or less of the same.
+    pub fn is_less_than(&self, other: &Self) -> bool {
+        let rank = |fault: &Self| match *fault {
+            Self::Crossings(count) => (0, count as f32),
+            Self::Deep(share) => (1, share),
+            Self::Speed(speed_m_s) => (2, speed_m_s),
+            Self::Strain(strain) => (3, strain),
+        };
+        rank(self) < rank(other)
+    }
+
     /// The first fault of one frame.
     ///
     /// * `body_speed_m_s`: speed of the body's fastest point.
@@ -118,6 +130,10 @@ mod tests {
         assert!(!Fault::Deep(0.006).resists(&Fault::Deep(0.02)));
         assert!(!Fault::Deep(0.006).resists(&Fault::Speed(20.0)), "another fault");
         assert!(Fault::Crossings(3).resists(&Fault::Crossings(4)));
+        assert!(Fault::Deep(0.006).is_less_than(&Fault::Deep(0.007)));
+        assert!(!Fault::Deep(0.007).is_less_than(&Fault::Deep(0.007)));
+        assert!(Fault::Crossings(9).is_less_than(&Fault::Strain(0.2)), "it holds together again");
+        assert!(!Fault::Speed(20.0).is_less_than(&Fault::Deep(0.5)));
         let spot = FrameQuality { deep_vertex_frames: 5, ..calm() };
         assert_eq!(Fault::of(&spot, 0.0), None);
     }

@@ -107,6 +107,9 @@ pub enum JobError {
         /// What the simulator said.
         source: SimulateError,
     },
+    /// Nothing can be simulated, this frame or another.
+    #[error("{0}; nor can frames be simulated that were before")]
+    OutOfOrder(SimulateError),
     /// A state could not be read.
     #[error(transparent)]
     Io(#[from] io::Error),

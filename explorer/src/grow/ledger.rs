@@ -97,6 +97,7 @@ pub struct Ledger {
     /// A round that tags interrupted; what is left of it comes after theirs.
     parked: Option<Round>,
     set_aside: BTreeSet<StateId>,
+    failed_jobs: u64,
     quality: FrameQuality,
     published: Option<PublishRecord>,
     steering: Steering,
@@ -143,6 +144,7 @@ impl Ledger {
             round: Round::empty(0, 0),
             parked: None,
             set_aside: BTreeSet::new(),
+            failed_jobs: 0,
             quality: FrameQuality::default(),
             published: None,
             steering: Steering::new(primary),
@@ -170,9 +172,15 @@ impl Ledger {
         &self.quality
     }
 
-    /// Dead ends whose job was given up: they stay merged and are not chosen again.
+    /// Dead ends whose job was given up: they stay merged, and are not chosen again before they are
+    /// reconsidered.
     pub fn set_aside(&self) -> &BTreeSet<StateId> {
         &self.set_aside
+    }
+
+    /// Jobs that were given up; one dead end may have cost several.
+    pub fn failed_jobs(&self) -> u64 {
+        self.failed_jobs
     }
 
     /// What jobs are chosen by.
@@ -319,6 +327,13 @@ impl Ledger {
                 Ok(())
             }
             Record::Interrupted(tagged) => self.apply_interruption(tagged),
+            Record::Reconsidered if !self.round.is_done() => {
+                Err(LedgerError::OutOfTurn("another chance"))
+            }
+            Record::Reconsidered => {
+                self.set_aside.clear();
+                Ok(())
+            }
         }
     }
 
@@ -448,6 +463,7 @@ impl Ledger {
             Job::Initial(_) => Err(LedgerError::OutOfTurn("a failure of the initial pass")),
             Job::Expand(start) => {
                 self.set_aside.insert(start);
+                self.failed_jobs += 1;
                 self.round.done += 1;
                 Ok(())
             }

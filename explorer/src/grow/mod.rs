@@ -32,6 +32,7 @@ pub mod round;
 pub mod similar;
 pub mod states;
 pub mod view;
+pub mod visits;
 pub mod work;
 
 #[cfg(test)]

@@ -35,6 +35,8 @@ pub enum Record {
     Interrupted(TagRecord),
     /// Many of the others, packed (see [`super::journal`]); only the journal sees this one.
     Compacted(Vec<u8>),
+    /// Nothing else was left: dead ends whose job was given up may be chosen again.
+    Reconsidered,
 }
 
 /// Tags that were read.

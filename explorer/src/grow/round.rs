@@ -5,9 +5,9 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use protocol::{PoseId, StateId};
+use protocol::{EdgeId, PoseId, StateId};
 
 use super::aim::Aims;
 use super::class::Classifier;
@@ -26,6 +26,10 @@ use crate::simulator::Simulator;
 
 /// How often a running round looks whether it is to stop.
 const POLL: Duration = Duration::from_millis(50);
+/// How long to wait before a program that is out of order is tried again (ms), time after time.
+const PAUSES_MS: [u64; 4] = [250, 500, 1000, 2000];
+/// How many frames that were simulated before it is tried on.
+const TRIALS: u64 = 4;
 
 /// How a round ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -50,6 +54,12 @@ pub enum RoundError {
     /// The initial pass needs every edge once, so it cannot do without this one.
     #[error("the initial pass: {0}")]
     Initial(JobError),
+    /// The simulator can do nothing at all.
+    #[error(
+        "the simulator is out of order: {0}. No job was given up for it: mend it, and run the same \
+         command again"
+    )]
+    OutOfOrder(JobError),
     /// A state could not be read.
     #[error("the state file: {0}; mend this and run again")]
     Read(std::io::Error),
@@ -95,10 +105,11 @@ pub async fn run(
     let ended = collect(work, &workers, &mut early, (should_stop, tags), frames, each).await;
     // Also on an error: workers still running are not waited for longer than a frame.
     let rest = workers.join(simulators);
+    if ended.is_ok() {
+        // Also of what is dropped: it was simulated.
+        work.add_cpu_s(rest.iter().map(|done| done.cpu_s).sum())?;
+    }
     if matches!(ended, Ok(Ended::Interrupted(_))) {
-        for done in &rest {
-            work.add_cpu_s(done.cpu_s)?;
-        }
         // What no worker had taken up again, and what they leave now.
         *paused = Paused { round, under_way: shared.under_way(), ..Paused::default() };
         paused.keep(&starts, early, rest);
@@ -147,6 +158,8 @@ struct Shared {
     aims: Arc<Aims>,
     states_max: usize,
     retries: bool,
+    /// Frames that were simulated before.
+    trials: Vec<(StateId, EdgeId, StateId)>,
     starts: Vec<Option<Start>>,
     next: AtomicUsize,
     abandon: AtomicBool,
@@ -173,6 +186,7 @@ impl Shared {
             aims: Arc::clone(&ledger.round().aims),
             states_max: if tagged { TAGGED_STATES_MAX } else { JOB_STATES_MAX },
             retries: simulators.iter().any(|simulator| simulator.may_recover()),
+            trials: work.graph().some_frames(TRIALS),
             starts,
             next: AtomicUsize::new(ledger.round().done),
             abandon: AtomicBool::new(false),
@@ -202,17 +216,20 @@ impl Shared {
 
     /// One job, from where it stands to its end or until it is to be left.
     fn job(&self, simulator: &mut dyn Simulator, place: usize, start: Start) -> Done {
-        let clock = CpuClock::start();
+        let (clock, program_cpu_s) = (CpuClock::start(), simulator.program_cpu_s());
         let context = self.context();
         let (outcome, expansion) = match start {
             (Job::Initial(planned), state, _) => {
                 let planned = &self.plan.jobs()[planned];
-                let run = || job::initial(&context, simulator, planned, state);
-                (twice(self.retries, run), None)
+                let run = |simulator: &mut dyn Simulator| {
+                    job::initial(&context, simulator, planned, state)
+                };
+                (self.again(simulator, run), None)
             }
             (Job::Expand(_), state, pose) => self.expand(&context, simulator, (state, pose)),
         };
-        Done { place, outcome, expansion, cpu_s: clock.elapsed_s() }
+        let cpu_s = clock.elapsed_s() + simulator.program_cpu_s() - program_cpu_s;
+        Done { place, outcome, expansion, cpu_s }
     }
 
     fn expand(
@@ -227,20 +244,55 @@ impl Shared {
             Ok(expansion) => expansion,
             Err(error) => return (Err(error.into()), None),
         };
-        let outcome = twice(self.retries, || expansion.run(context, simulator));
+        let outcome = self.again(simulator, |simulator| expansion.run(context, simulator));
         let left = matches!(outcome, Err(JobError::Abandoned));
         (outcome, left.then_some(expansion))
     }
-}
 
-/// Once more where the simulator may have recovered.
-fn twice(
-    retries: bool,
-    mut run: impl FnMut() -> Result<Outcome, JobError>,
-) -> Result<Outcome, JobError> {
-    match run() {
-        Err(JobError::Simulate { .. }) if retries => run(),
-        outcome => outcome,
+    /// Runs a job, once more where the simulator may have recovered, and again after each of a few
+    /// pauses where it is out of order.
+    fn again(
+        &self,
+        simulator: &mut dyn Simulator,
+        mut run: impl FnMut(&mut dyn Simulator) -> Result<Outcome, JobError>,
+    ) -> Result<Outcome, JobError> {
+        match run(simulator) {
+            Err(JobError::Simulate { .. }) if self.retries => {}
+            outcome => return outcome,
+        }
+        let mut pauses = PAUSES_MS.iter().copied().map(Duration::from_millis);
+        loop {
+            match run(simulator) {
+                Err(JobError::Simulate { source, .. })
+                    if simulator.is_out_of_order() && self.fails_at_all(simulator) =>
+                {
+                    let pause = pauses.next().ok_or(JobError::OutOfOrder(source))?;
+                    self.wait(pause)?;
+                }
+                outcome => return outcome,
+            }
+        }
+    }
+
+    /// Whether nothing can be simulated. A program may end at one step and be sound at others, so it
+    /// is tried on a few that it did before.
+    fn fails_at_all(&self, simulator: &mut dyn Simulator) -> bool {
+        let mut fails = |&(state, edge, _): &(StateId, EdgeId, StateId)| {
+            let Ok(state) = self.states.read(state) else { return false };
+            simulator.step(&state, edge).is_err() && simulator.is_out_of_order()
+        };
+        self.trials.iter().all(&mut fails)
+    }
+
+    fn wait(&self, pause: Duration) -> Result<(), JobError> {
+        let clock = Instant::now();
+        while clock.elapsed() < pause {
+            if self.abandon.load(Ordering::Relaxed) {
+                return Err(JobError::Abandoned);
+            }
+            std::thread::sleep(POLL.min(pause));
+        }
+        Ok(())
     }
 }
 
@@ -372,6 +424,7 @@ fn give_up(work: &mut Work, error: JobError) -> Result<Option<JobError>, RoundEr
     match error {
         JobError::Abandoned => Ok(None),
         JobError::Io(error) => Err(RoundError::Read(error)),
+        error @ JobError::OutOfOrder(_) => Err(RoundError::OutOfOrder(error)),
         error if work.ledger().phase() == Phase::Initial => Err(RoundError::Initial(error)),
         error => {
             work.fail()?;

@@ -147,7 +147,10 @@ impl Simulator for Toy {
         Ok(Frame { state: next, quality })
     }
 
-    fn drape(&mut self) -> Result<Frame, SimulateError> {
+    fn drape(&mut self, should_stop: &dyn Fn() -> bool) -> Result<Frame, SimulateError> {
+        if should_stop() {
+            return Err(SimulateError("stopped".into()));
+        }
         let positions = vec![[0, 0, 0], [16_384, 0, 0], [0, 16_384, 0]];
         let state = GridState { positions, velocities: vec![[0; 3]; 3] };
         Ok(Frame { state, quality: FrameQuality::default() })

@@ -56,6 +56,19 @@ impl Graph {
         &all[..all.partition_point(|id| since(id).is_some_and(|since| since <= commit))]
     }
 
+    /// At most `count` frames that were simulated, by what they started from, their edge and the
+    /// state at their end; spread evenly, the first of all among them.
+    pub fn some_frames(&self, count: u64) -> Vec<(StateId, EdgeId, StateId)> {
+        let frames = self.simulated_frames();
+        let count = count.min(frames);
+        let ids = (0..count).map(|place| StateId(1 + place * frames / count));
+        let frame = |id: StateId| {
+            let (parent, edge) = self.state(id).parent?;
+            Some((parent, edge, id))
+        };
+        ids.filter_map(frame).collect()
+    }
+
     /// The job that made a state, as the commit that recorded it.
     pub fn commit_of(&self, state: StateId) -> u64 {
         self.moments().partition_point(|moment| moment.states <= state.0) as u64

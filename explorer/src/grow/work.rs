@@ -235,6 +235,19 @@ impl Work {
         self.ledger.open_round()
     }
 
+    /// Gives dead ends whose job was given up another chance, and chooses the next round; false where
+    /// there is none.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub fn reconsider(&mut self) -> Result<bool, WorkError> {
+        if self.ledger.set_aside().is_empty() {
+            return Ok(false);
+        }
+        self.record(&Record::Reconsidered)?;
+        Ok(self.open_round())
+    }
+
     /// Records the drape.
     ///
     /// # Errors

@@ -369,6 +369,10 @@ fn regions_metric_and_classes_are_resolved_or_refused_by_name() {
         files.write("scene.toml", whole.replacen(from, to, 1));
         files.refused("scene.toml", &words);
     }
+    for frames in ["0", "10001", "2147483648"] {
+        files.write("scene.toml", format!("{SCENE}[exploration]\ndrape_frames = {frames}\n"));
+        files.refused("scene.toml", &["exploration.drape_frames", "1 to 10000"]);
+    }
     files.write("scene.toml", format!("{SCENE}[simulator]\ncommand = []\n"));
     files.refused("scene.toml", &["simulator.command", "program"]);
 }

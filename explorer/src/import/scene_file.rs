@@ -47,6 +47,8 @@ use super::metric::{ClassTable, MetricTable};
 use crate::pipe::Foreign;
 use crate::scene::{ExplorationSettings, Fabric};
 
+/// Longest way from the rest pose to the start pose (frames).
+const DRAPE_FRAMES_MAX: f32 = 10_000.0;
 /// Layers that a garment may have.
 pub const LAYERS_MAX: usize = 16;
 /// Frames per second that a scene may have.
@@ -356,6 +358,9 @@ impl SceneFile {
         ];
         if let Some((key, _)) = counts.iter().find(|(_, count)| *count == Some(0)) {
             return Err(value(&format!("exploration.{key}"), "must be at least 1"));
+        }
+        if let Some(frames) = t.drape_frames {
+            in_range("exploration.drape_frames", frames as f32, [1.0, DRAPE_FRAMES_MAX])?;
         }
         Ok(ExplorationSettings {
             velocity_time_s: t.velocity_time_s.unwrap_or(default.velocity_time_s),

@@ -2,7 +2,8 @@
 //!
 //! Whatever the program does, the run goes on: one that hangs is ended, one that died is started
 //! anew, an answer that is not finite or of the wrong size is refused. Each costs one job, which is
-//! run once more and then set aside.
+//! run once more and then set aside. Only where nothing can be simulated at all, since the program
+//! cannot be started or ends at every frame, the run ends.
 
 mod process;
 
@@ -10,7 +11,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use cloth::{Mesh, Pose, Rigid, Skeleton, State, Vec3, measure};
+use cloth::{Crossings, Mesh, Pose, Rigid, Skeleton, State, Surface, Vec3, measure};
 use protocol::EdgeId;
 
 use self::process::{Answer, Process};
@@ -18,6 +19,7 @@ use crate::cloth_simulator::{ClothSimulatorFactory, to_grid, to_world};
 use crate::grid::GridState;
 use crate::scene::Scene;
 use crate::simulator::{Frame, FrameQuality, SimulateError, Simulator, SimulatorFactory};
+use crate::watchdog;
 
 /// Version of the protocol.
 pub const PIPE_PROTOCOL: u32 = 1;
@@ -49,6 +51,7 @@ pub fn simulators(scene: &Scene) -> Result<Box<dyn SimulatorFactory>, SimulateEr
 pub struct PipeFactory {
     scene: Arc<Scene>,
     mesh: Arc<Mesh>,
+    surface: Arc<Surface>,
     foreign: Foreign,
     hello: Arc<Vec<u8>>,
 }
@@ -63,19 +66,31 @@ impl PipeFactory {
         let mesh = Mesh::new(garment.positions.clone(), garment.triangles.clone())
             .map_err(|e| SimulateError(format!("garment {}: {e}", garment.name)))?;
         let hello = Arc::new(hello(scene));
-        Ok(Self { scene: Arc::new(scene.clone()), mesh: Arc::new(mesh), foreign, hello })
+        let surface = Arc::new(Surface::new(&scene.body.rest_positions, &scene.body.triangles));
+        let (scene, mesh) = (Arc::new(scene.clone()), Arc::new(mesh));
+        Ok(Self { scene, mesh, surface, foreign, hello })
     }
 }
 
 impl SimulatorFactory for PipeFactory {
     fn simulator(&self) -> Box<dyn Simulator> {
-        Box::new(PipeSimulator { factory: self.clone(), process: None })
+        Box::new(PipeSimulator {
+            factory: self.clone(),
+            process: None,
+            crossings: Crossings::new(&self.mesh),
+            is_out_of_order: false,
+            ended_cpu_s: 0.0,
+        })
     }
 }
 
 struct PipeSimulator {
     factory: PipeFactory,
     process: Option<Process>,
+    crossings: Crossings,
+    is_out_of_order: bool,
+    /// CPU time of processes that ended (s).
+    ended_cpu_s: f64,
 }
 
 impl PipeSimulator {
@@ -93,42 +108,62 @@ impl PipeSimulator {
         let request = request(&scene.body.skeleton, (&from, &to), &to_world(state, &from.hips()));
         let vertices = state.vertex_count();
         let world = self.ask(&request, vertices)?;
-        let stretch_max = measure::stretch_max(&self.factory.mesh, &world.positions);
         let state = to_grid(&world, &to.hips())
             .map_err(|e| SimulateError(format!("the program's answer: {e}")))?;
-        let quality = FrameQuality {
+        let quality = self.measured(&to_world(&state, &to.hips()), &to);
+        Ok(Frame { state, quality })
+    }
+
+    /// What our own simulator's frames are measured by; nothing of it is held against the program.
+    fn measured(&mut self, world: &State, pose: &Pose) -> FrameQuality {
+        let PipeFactory { scene, mesh, surface, .. } = &self.factory;
+        let crossings = self.crossings.find(&world.positions).len() as u64;
+        let mut quality = FrameQuality {
             frames: 1,
-            vertex_frames: vertices as u64,
-            stretch_max,
+            vertex_frames: world.positions.len() as u64,
+            crossings,
+            crossed_frames: u64::from(crossings > 0),
+            stretch_max: measure::stretch_max(mesh, &world.positions),
+            speed_max_m_s: world.velocities.iter().map(|v| v.length()).fold(0.0, f32::max),
             ..FrameQuality::default()
         };
-        Ok(Frame { state, quality })
+        let (mut joints, mut body) = (Vec::new(), Vec::new());
+        scene.body.skin(pose, &mut joints, &mut body);
+        let (posed, offset) = (surface.posed(&body), scene.garment.fabric.offset);
+        watchdog::measure_depth(surface, &posed, &world.positions, offset, &mut quality);
+        quality
     }
 
     fn ask(&mut self, request: &[u8], vertices: usize) -> Result<State, SimulateError> {
         let foreign = &self.factory.foreign;
         let timeout = Duration::from_secs_f32(foreign.timeout_s);
         let answer_bytes = 24 * vertices;
+        self.is_out_of_order = true;
         let mut process = match self.process.take() {
             Some(process) => process,
             None => Process::start(foreign, &self.factory.hello, answer_bytes, timeout)
                 .map_err(|e| named(foreign, &e))?,
         };
-        // Dropped on any error but the program's own: it is ended and started anew.
-        match process.ask(request, timeout).map_err(|e| named(foreign, &e))? {
-            Answer::Failed(text) => {
+        let answer = process.ask(request, timeout);
+        let late = answer.as_ref().is_err_and(|none| none.late);
+        self.is_out_of_order = !late && !process.has_answered();
+        let text = match answer {
+            Ok(Answer::State(bytes)) if bytes.len() == answer_bytes => {
                 self.process = Some(process);
-                Err(named(foreign, &text))
+                return Ok(read_state(&bytes, vertices));
             }
-            Answer::State(bytes) if bytes.len() != answer_bytes => Err(named(
-                foreign,
-                &format!("answered {} bytes, {answer_bytes} were expected", bytes.len()),
-            )),
-            Answer::State(bytes) => {
+            Ok(Answer::Failed(text)) => {
                 self.process = Some(process);
-                Ok(read_state(&bytes, vertices))
+                return Err(named(foreign, &text));
             }
-        }
+            Ok(Answer::State(bytes)) => {
+                format!("answered {} bytes, {answer_bytes} were expected", bytes.len())
+            }
+            Err(none) => none.text,
+        };
+        // Dropped here: it is ended, and started anew.
+        self.ended_cpu_s += process.cpu_s();
+        Err(named(foreign, &text))
     }
 }
 
@@ -146,7 +181,15 @@ impl Simulator for PipeSimulator {
         true
     }
 
-    fn drape(&mut self) -> Result<Frame, SimulateError> {
+    fn is_out_of_order(&self) -> bool {
+        self.is_out_of_order
+    }
+
+    fn program_cpu_s(&self) -> f64 {
+        self.ended_cpu_s + self.process.as_ref().map_or(0.0, Process::cpu_s)
+    }
+
+    fn drape(&mut self, should_stop: &dyn Fn() -> bool) -> Result<Frame, SimulateError> {
         let scene = Arc::clone(&self.factory.scene);
         let rest = scene.body.skeleton.rest_pose();
         let start = &scene.primary.pose(scene.start).pose;
@@ -156,7 +199,10 @@ impl Simulator for PipeSimulator {
         let state = to_grid(&State { positions, velocities }, &rest.hips());
         let mut state = state.map_err(|e| SimulateError(e.to_string()))?;
         let (mut from, mut quality) = (rest.clone(), FrameQuality::default());
-        for frame in 1..=2 * frames {
+        for frame in 1..=2 * u64::from(frames) {
+            if should_stop() {
+                return Err(SimulateError("the drape was stopped".to_owned()));
+            }
             let t = (frame as f32 / frames as f32).min(1.0);
             let to = rest.interpolate(start, t * t * (3.0 - 2.0 * t));
             let moved = self

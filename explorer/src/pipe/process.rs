@@ -9,9 +9,10 @@
 use std::io::{Read, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::Foreign;
+use crate::cpu::program_cpu_s;
 
 /// From us: what stays the same, as JSON.
 const HELLO: u8 = 1;
@@ -36,6 +37,20 @@ pub enum Answer {
     Failed(String),
 }
 
+/// Why there is no answer, in words.
+#[derive(Debug)]
+pub struct NoAnswer {
+    pub text: String,
+    /// It was given the time, and did not take more than that.
+    pub late: bool,
+}
+
+impl From<String> for NoAnswer {
+    fn from(text: String) -> Self {
+        Self { text, late: false }
+    }
+}
+
 type Message = Result<(u8, Vec<u8>), String>;
 
 /// A running program; ended when it is dropped. Two threads move bytes, so that no pipe that is
@@ -44,6 +59,8 @@ pub struct Process {
     child: Child,
     requests: Sender<Vec<u8>>,
     answers: Receiver<Message>,
+    has_answered: bool,
+    waited: Duration,
 }
 
 impl Process {
@@ -70,9 +87,10 @@ impl Process {
         std::thread::spawn(move || write_all(stdin, &to_write));
         let limit = answer_bytes.max(TEXT_BYTES_MAX);
         std::thread::spawn(move || read_all(stdout, limit, &read));
-        let mut process = Self { child, requests, answers };
+        let (has_answered, waited) = (false, Duration::ZERO);
+        let mut process = Self { child, requests, answers, has_answered, waited };
         process.send(HELLO, hello);
-        match process.receive(timeout.max(START_TIMEOUT))? {
+        match process.receive(timeout.max(START_TIMEOUT)).map_err(|none| none.text)? {
             (READY, _) => Ok(process),
             (FAILED, text) => Err(words(&text)),
             (kind, _) => Err(format!("answered hello with a message of kind {kind}")),
@@ -80,13 +98,27 @@ impl Process {
     }
 
     /// One step.
-    pub fn ask(&mut self, request: &[u8], timeout: Duration) -> Result<Answer, String> {
+    pub fn ask(&mut self, request: &[u8], timeout: Duration) -> Result<Answer, NoAnswer> {
         self.send(STEP, request);
-        match self.receive(timeout)? {
-            (STATE, bytes) => Ok(Answer::State(bytes)),
-            (FAILED, text) => Ok(Answer::Failed(words(&text))),
-            (kind, _) => Err(format!("answered a step with a message of kind {kind}")),
-        }
+        let answer = match self.receive(timeout)? {
+            (STATE, bytes) => Answer::State(bytes),
+            (FAILED, text) => Answer::Failed(words(&text)),
+            (kind, _) => {
+                return Err(format!("answered a step with a message of kind {kind}").into());
+            }
+        };
+        self.has_answered = true;
+        Ok(answer)
+    }
+
+    /// Whether it ever answered a step.
+    pub fn has_answered(&self) -> bool {
+        self.has_answered
+    }
+
+    /// CPU time that it took so far, or else how long it was waited for (s).
+    pub fn cpu_s(&self) -> f64 {
+        program_cpu_s(self.child.id()).unwrap_or(self.waited.as_secs_f64())
     }
 
     fn send(&self, kind: u8, payload: &[u8]) {
@@ -97,13 +129,17 @@ impl Process {
         let _ = self.requests.send(bytes);
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<(u8, Vec<u8>), String> {
-        match self.answers.recv_timeout(timeout) {
-            Ok(message) => message,
+    fn receive(&mut self, timeout: Duration) -> Result<(u8, Vec<u8>), NoAnswer> {
+        let clock = Instant::now();
+        let answer = self.answers.recv_timeout(timeout);
+        self.waited += clock.elapsed();
+        match answer {
+            Ok(message) => Ok(message?),
             Err(RecvTimeoutError::Timeout) => {
-                Err(format!("no answer in {} s; it was ended", timeout.as_secs_f32()))
+                let text = format!("no answer in {} s; it was ended", timeout.as_secs_f32());
+                Err(NoAnswer { text, late: true })
             }
-            Err(RecvTimeoutError::Disconnected) => Err("it ended".to_owned()),
+            Err(RecvTimeoutError::Disconnected) => Err("it ended".to_owned().into()),
         }
     }
 }

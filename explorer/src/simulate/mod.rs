@@ -60,11 +60,20 @@ impl<'a> Straight<'a> {
     /// Drapes the scene's garment on its start pose.
     ///
     /// # Errors
-    /// A garment that the kernel refuses or that cannot be draped.
+    /// A garment that the kernel refuses or that cannot be draped, or a scene with a program of
+    /// its own: a walk's steps, nudges and measures are the kernel's.
     pub fn new(scene: &'a Scene, options: Options) -> Result<Self, SimulateError> {
+        if let Some(foreign) = &scene.simulator {
+            return Err(SimulateError(format!(
+                "scene {}: its [simulator] is the program {:?}, and a walk is simulated by our own \
+                 kernel alone; take [simulator] out, or explore the scene with its program",
+                scene.name,
+                foreign.command.join(" ")
+            )));
+        }
         let mut simulator = ClothSimulator::new(scene)?;
         // Draped alike whatever the options, so that walks start alike.
-        let Frame { state, quality } = simulator.drape()?;
+        let Frame { state, quality } = simulator.drape(&|| false)?;
         Ok(Self::from_drape(scene, simulator, (state, quality), options))
     }
 

@@ -83,3 +83,12 @@ fn the_hood_rests_on_the_head_in_a_walk_and_falls_and_stays_down_in_a_run() {
     let up = ran[60..].iter().filter(|up| **up).count();
     assert!(up < 12, "the hood came up again in a run: {ran:?}");
 }
+
+#[test]
+fn a_scene_with_a_program_of_its_own_is_refused() {
+    let mut scene = crate::builtin::robe(Some(1500)).unwrap();
+    let command = vec!["python3".to_owned(), "springs.py".to_owned()];
+    scene.simulator = Some(crate::pipe::Foreign { command, folder: ".".into(), timeout_s: 1.0 });
+    let error = Straight::new(&scene, Options::default()).unwrap_err().to_string();
+    assert!(error.contains("python3 springs.py") && error.contains("[simulator]"), "{error}");
+}
