@@ -16,7 +16,7 @@ fn dead_ends_set_aside_get_a_second_chance() {
     let mut store = Memory::default();
     explore(&scene, &sound, (folder.path(), &mut store), &options(1)).unwrap();
     let last = EdgeId(scene.primary.edges().len() as u32 - 1);
-    let broken = Toy { broken: Some(last), ..sound.clone() };
+    let broken = Toy { broken: Some(last), ..sound };
     let mut before = 0;
     for run in 1..=2 {
         let end = explore(&scene, &broken, (folder.path(), &mut store), &endless).unwrap();

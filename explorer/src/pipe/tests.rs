@@ -148,12 +148,9 @@ fn a_broken_program_costs_no_job() {
         assert!(std::fs::read(folder.path().join("work/journal")).unwrap() == before);
     }
     // Mended while it is waited for.
-    let mended = std::thread::spawn({
-        let program = program.clone();
-        move || {
-            std::thread::sleep(Duration::from_millis(900));
-            write_slow(&program);
-        }
+    let mended = std::thread::spawn(move || {
+        std::thread::sleep(Duration::from_millis(900));
+        write_slow(&program);
     });
     let (summary, failures) = run(&scene, folder.path(), 60);
     mended.join().unwrap();
