@@ -186,6 +186,18 @@ pub struct Serve {
     /// Where the server's certificate is kept [default: beside a local store].
     #[arg(long, value_name = "DIR")]
     pub identity: Option<PathBuf>,
+    /// Players at the same time; a few hundred kilobytes of buffers each.
+    #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub players_max: u32,
+    /// Chunks kept in memory, in megabytes.
+    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u32).range(..=1 << 20))]
+    pub cache_mb: u32,
+    /// How often the store is asked for a new version, one small read each time; 5s spares a bucket.
+    #[arg(long, default_value = "250ms", value_parser = interval)]
+    pub poll: Duration,
+    /// How often what players walked is written to the store.
+    #[arg(long, default_value = "10s", value_parser = interval)]
+    pub telemetry: Duration,
 }
 
 /// `toile play`.
@@ -541,6 +553,13 @@ fn later_walk(text: &str) -> Result<(Duration, String), String> {
     Ok((duration(time)?, walk.to_owned()))
 }
 
+/// A time between two things that are done again and again.
+fn interval(text: &str) -> Result<Duration, String> {
+    let interval = duration(text)?;
+    let range = Duration::from_millis(10)..=Duration::from_secs(3600);
+    range.contains(&interval).then_some(interval).ok_or_else(|| "from 10ms to 1h".to_string())
+}
+
 fn wind(text: &str) -> Result<f32, String> {
     let speed = text.parse::<f32>().ok().filter(|m_s| m_s.abs() <= client_lib::free::FORCE_MAX);
     speed.ok_or_else(|| format!("metres a second, at most {}", client_lib::free::FORCE_MAX))
@@ -558,5 +577,7 @@ mod tests {
         for wrong in ["", "s", "-1s", "5 parsecs", "1e400s", "NaN"] {
             assert!(duration(wrong).is_err(), "{wrong}");
         }
+        assert_eq!(interval("10ms"), Ok(Duration::from_millis(10)));
+        assert!(interval("0s").is_err() && interval("2h").is_err());
     }
 }

@@ -21,6 +21,10 @@ pub fn run(a: args::Serve) -> Result<()> {
         http: Some(a.http),
         token: a.token,
         tag_token: a.tag_token,
+        players_max: a.players_max as usize,
+        cache_bytes_max: (a.cache_mb as usize) << 20,
+        poll_interval: a.poll,
+        telemetry_interval: a.telemetry,
         ..ServerConfig::new(opened.store, a.listen, identity)
     };
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;

@@ -95,6 +95,14 @@ impl Region {
         size_of::<Self>() + 2 * numbers + fixes
     }
 
+    /// About what `states` take once they are decoded over `columns`, in bytes, fixes apart.
+    pub fn bytes_expected(states: usize, columns: usize) -> usize {
+        // Regions hold 16 to 32 states.
+        let regions = states.div_ceil(16);
+        2 * states * columns
+            + regions * (size_of::<Self>() + 2 * TIERS[TIERS.len() - 1].min(columns))
+    }
+
     /// Whether a state lies here.
     fn contains(&self, state: StateId) -> bool {
         state >= self.first_state && state.0 - self.first_state.0 < self.state_count as u64

@@ -192,12 +192,17 @@ impl Shared {
 
     /// Waits until `done` gives something, or the time is over.
     fn wait<T>(&self, timeout: Duration, done: impl Fn(&State) -> Option<T>) -> Option<T> {
-        let end = Instant::now() + timeout;
+        // Longer than clocks go: for ever.
+        let end = Instant::now().checked_add(timeout);
         let mut state = self.lock();
         loop {
             if let Some(found) = done(&state) {
                 return Some(found);
             }
+            let Some(end) = end else {
+                state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
             let left = end.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return None;

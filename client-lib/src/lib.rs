@@ -8,9 +8,11 @@
 //! Per character: [`Character::step`] once per tick of the scene, [`Character::sample`] once per
 //! frame of the screen, [`decode`] wherever the host wants the work done.
 //!
-//! Architecture invariants: nothing here waits for a lock or a socket on the caller's side, apart
-//! from functions that say so in their name (`wait_*`, `close`); the core knows no network, no
-//! file and no thread ([`walk`], a tool, reads its list from a file); neither explorer nor server is linked.
+//! Architecture invariants: nothing here waits for the network on the caller's side, apart from functions
+//! that say so in their name (`wait_*`, `close`, and dropping a client, which closes it); what a frame
+//! loop calls waits for no lock either, the other functions of a client take one that its thread holds
+//! for copying a few words. The core knows no network, no file and no thread ([`walk`], a tool, reads its
+//! list from a file); neither explorer nor server is linked.
 //!
 //! ```no_run
 //! # #[cfg(feature = "driver")]

@@ -14,23 +14,18 @@ use protocol::scene::{GarmentChunk, SceneChunk};
 use protocol::{ChunkHash, DecodeError, GarmentId, VersionNumber};
 
 use crate::cache::{Cache, Region};
-use crate::prefetch::{self, EdgeWeights, Horizon, Plan};
+use crate::prefetch::{EdgeWeights, Horizon, Plan};
 use crate::scene::Scene;
 use crate::shared::Stage;
 use crate::telemetry::Batch;
-use crate::version::{Parts, Version, VersionError, View};
+use crate::version::{Parts, Version, VersionError, View, decoded_bytes};
 use upsampled::Upsamplers;
 
+mod ahead;
+mod first_cloth;
 mod upsampled;
 
-mod first_cloth;
-
 pub use first_cloth::FirstCloth;
-
-/// Of the cache's budget, the share that is planned for; the rest is for what decoding adds.
-const PLANNED_SHARE: f32 = 0.8;
-/// What lies at most this many frames ahead is urgent.
-const URGENT_FRAMES: u32 = 30;
 
 /// Why a garment's chunk or version was refused. The version before is played on.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -132,8 +127,14 @@ pub struct GarmentLoader {
     plan: Plan,
     parts: PartsSoFar,
     upsamplers: Upsamplers,
-    /// Chunks that are broken or missing on the server; tried again with the next version.
+    /// Chunks that are broken; tried again with the next version.
     refused: BTreeSet<ChunkHash>,
+    /// Chunks that the server does not have; tried again when the driver says so.
+    missing: BTreeSet<ChunkHash>,
+    /// Chunks for which there was no room beside what is planned; tried again with another plan.
+    unfit: BTreeSet<ChunkHash>,
+    /// What was decoded of streamed chunks: bytes taken, bytes expected.
+    decoded: [usize; 2],
     changed: bool,
     first_shown: bool,
     first_cloth: Option<FirstCloth>,
@@ -171,6 +172,9 @@ impl GarmentLoader {
             parts: PartsSoFar::default(),
             upsamplers: Upsamplers::default(),
             refused: BTreeSet::new(),
+            missing: BTreeSet::new(),
+            unfit: BTreeSet::new(),
+            decoded: [0; 2],
             changed: false,
             first_shown: false,
             first_cloth: None,
@@ -207,6 +211,8 @@ impl GarmentLoader {
             return Err(LoadError::Profile { garment, found });
         }
         self.refused.clear();
+        self.missing.clear();
+        self.unfit.clear();
         let oldest = |listing: &GarmentVersion| listing.generations.first().map(|g| g.chunk.hash);
         let held = self.current.as_ref().map(|version| version.lineage());
         let other_basis = held.is_some_and(|lineage| lineage != oldest(garment));
@@ -221,6 +227,7 @@ impl GarmentLoader {
     /// # Errors
     /// It is broken; it is not wanted again before the next version.
     pub fn handle_chunk(&mut self, chunk: ChunkHash, bytes: &[u8]) -> Result<(), LoadError> {
+        self.missing.remove(&chunk);
         let read = self.read(chunk, bytes);
         if read.is_err() {
             self.refused.insert(chunk);
@@ -228,9 +235,26 @@ impl GarmentLoader {
         read
     }
 
-    /// The server does not have this chunk.
+    /// The server does not have this chunk: it is not wanted until [`GarmentLoader::retry_missing`].
     pub fn handle_missing(&mut self, chunk: ChunkHash) {
-        self.refused.insert(chunk);
+        self.missing.insert(chunk);
+    }
+
+    /// The server may have a chunk by now that it did not have.
+    pub fn retry_missing(&mut self, chunk: ChunkHash) {
+        self.missing.remove(&chunk);
+    }
+
+    /// Whether nothing can be played before the next version is announced.
+    pub fn is_stuck(&self) -> bool {
+        if self.current.is_some() {
+            return false;
+        }
+        let Some((_, next)) = &self.next else { return true };
+        let mut stuck = false;
+        self.parts.lacking(next, |chunk| stuck |= self.refused.contains(&chunk.hash));
+        let initial = next.regions.iter().filter(|region| region.initial);
+        stuck || initial.into_iter().any(|region| self.refused.contains(&region.chunk.hash))
     }
 
     /// Counts what was walked, for prefetching.
@@ -250,6 +274,8 @@ impl GarmentLoader {
             return Ok(false);
         }
         let completed = self.complete_next();
+        // What it took in is shown right now.
+        self.changed = false;
         if let Some(version) = &self.current {
             let resident = Arc::new(self.cache.snapshot());
             let version = Arc::clone(version);
@@ -259,62 +285,6 @@ impl GarmentLoader {
             self.show_first_cloth();
         }
         completed
-    }
-
-    /// Looks ahead of the cursors, and adds every chunk that is lacking to `wants`.
-    pub fn plan(&mut self, wants: &mut BTreeMap<ChunkHash, (ChunkRef, Need)>) {
-        let mut add = |chunk: ChunkRef, need: Need| {
-            if !self.refused.contains(&chunk.hash) {
-                let want = wants.entry(chunk.hash).or_insert((chunk, need));
-                want.1 = want.1.min(need);
-            }
-        };
-        if let Some((_, next)) = &self.next {
-            let cache = self.next_cache.as_ref().unwrap_or(&self.cache);
-            // First cloth needs the leading columns alone: the others come after them.
-            let first = self.current.is_none();
-            let later = next.generations.iter().skip(1);
-            let later: BTreeSet<ChunkHash> =
-                later.filter(|_| first).map(|generation| generation.chunk.hash).collect();
-            self.parts.lacking(next, |chunk| {
-                let is_later = later.contains(&chunk.hash);
-                add(chunk, if is_later { Need::Urgent } else { Need::Version });
-            });
-            let initial = next.regions.iter().filter(|region| region.initial);
-            let here = |chunk| cache.contains(chunk) || self.parts.regions.contains_key(chunk);
-            let lacking = initial.filter(|region| !here(&region.chunk.hash));
-            lacking.for_each(|region| add(region.chunk, Need::Version));
-        }
-        let (Some(version), Some(view)) = (&self.current, self.stage.view()) else { return };
-        let cursors = self.stage.cursors();
-        let ahead =
-            prefetch::ahead(version, &view.resident, &cursors, &self.weights, &self.horizon);
-        let budget_bytes = (self.budget_bytes as f32 * PLANNED_SHARE) as usize;
-        self.plan = prefetch::plan(&ahead, budget_bytes);
-        for chunk in &self.plan.fetch {
-            let soon = if chunk.frames <= URGENT_FRAMES { Need::Urgent } else { Need::Soon };
-            add(chunk.chunk, soon);
-        }
-        if let Some(upsampler) = self.lacking_upsampler() {
-            add(upsampler, Need::Soon);
-        }
-        // Whatever fits without pushing anything out.
-        let mut filled = self.cache.resident_bytes() - self.cache.initial_bytes();
-        filled += self.plan.fetch.iter().map(|ahead| ahead.chunk.bytes as usize).sum::<usize>();
-        for region in &version.listing().regions {
-            if !self.cache.contains(&region.chunk.hash) {
-                filled += region.chunk.bytes as usize;
-                if filled > budget_bytes {
-                    break;
-                }
-                add(region.chunk, Need::Idle);
-            }
-        }
-    }
-
-    /// Whether everything is here that the last plan found ahead of the cursors.
-    pub fn is_ahead(&self) -> bool {
-        self.plan.fetch.iter().all(|ahead| self.refused.contains(&ahead.chunk.hash))
     }
 
     /// What it holds in memory.
@@ -362,11 +332,12 @@ impl GarmentLoader {
     fn read_regions(&mut self, chunk: ChunkHash, bytes: &[u8]) -> Result<(), LoadError> {
         let garment = self.id();
         let listed = |listing: &GarmentVersion| {
-            listing.regions.iter().find(|r| r.chunk.hash == chunk).map(|r| r.initial)
+            let region = listing.regions.iter().find(|r| r.chunk.hash == chunk);
+            region.map(|region| (region.initial, decoded_bytes(listing, region)))
         };
         let next = self.next.as_ref().and_then(|(_, next)| listed(next));
         let current = self.current.as_ref().and_then(|version| listed(version.listing()));
-        let Some(initial) = next.or(current) else { return Ok(()) };
+        let Some((initial, expected_bytes)) = next.or(current) else { return Ok(()) };
         let regions = RegionChunk::decode(bytes).map_err(|source| LoadError::Chunk {
             garment,
             chunk,
@@ -385,7 +356,11 @@ impl GarmentLoader {
             }
             return Ok(());
         };
-        self.changed |= self.cache.insert(chunk, decoded, initial, &self.plan.keep);
+        if !initial {
+            self.decoded[0] += decoded.iter().map(Region::bytes).sum::<usize>();
+            self.decoded[1] += expected_bytes;
+        }
+        self.take_in(chunk, decoded, initial);
         Ok(())
     }
 
@@ -418,15 +393,13 @@ impl GarmentLoader {
     /// Decodes the regions that waited for the basis.
     fn take_in_regions(&mut self) -> Result<(), LoadError> {
         let garment = self.id();
-        let Some((_, decoder, _)) = &self.parts.basis else { return Ok(()) };
         for (chunk, (regions, initial)) in std::mem::take(&mut self.parts.regions) {
+            let Some((_, decoder, _)) = &self.parts.basis else { return Ok(()) };
             let codec = |why| LoadError::Codec { garment, chunk, why };
             let lacking = || codec("it refers to a basis generation that is not listed".into());
             let decoded = decode_all(decoder, &regions).map_err(codec);
             match decoded.and_then(|decoded| decoded.ok_or_else(lacking)) {
-                Ok(decoded) => {
-                    self.cache.insert(chunk, decoded, initial, &self.plan.keep);
-                }
+                Ok(decoded) => self.take_in(chunk, decoded, initial),
                 Err(error) => {
                     self.refused.insert(chunk);
                     return Err(error);
@@ -434,6 +407,14 @@ impl GarmentLoader {
             }
         }
         Ok(())
+    }
+
+    fn take_in(&mut self, chunk: ChunkHash, decoded: Vec<Region>, initial: bool) {
+        if self.cache.insert(chunk, decoded, initial, &self.plan.keep) {
+            self.changed = true;
+        } else {
+            self.unfit.insert(chunk);
+        }
     }
 
     fn id(&self) -> GarmentId {

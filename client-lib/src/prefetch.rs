@@ -10,7 +10,7 @@ use protocol::manifest::ChunkRef;
 use protocol::{ChunkHash, EdgeId, StateId};
 
 use crate::cache::Resident;
-use crate::version::Version;
+use crate::version::{Version, decoded_bytes};
 
 /// How far to look ahead.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,6 +54,8 @@ impl EdgeWeights {
 pub struct Ahead {
     /// The chunk.
     pub chunk: ChunkRef,
+    /// About what it takes in memory once it is decoded, in bytes.
+    pub decoded_bytes: usize,
     /// The soonest that a cursor can be there, in frames; 0 where one already stands.
     pub frames: u32,
     /// How likely one comes there on that way.
@@ -71,13 +73,13 @@ pub struct Plan {
     pub keep: BTreeSet<ChunkHash>,
 }
 
-/// The most pressing chunks that fit into `budget_bytes` together: the rest would only push each
-/// other out.
+/// The most pressing chunks that fit into `budget_bytes` together once they are decoded: the rest would
+/// only push each other out.
 pub fn plan(ahead: &[Ahead], budget_bytes: usize) -> Plan {
     let mut plan = Plan::default();
     let mut planned_bytes = 0;
     for chunk in ahead {
-        planned_bytes += chunk.chunk.bytes as usize;
+        planned_bytes += chunk.decoded_bytes;
         if planned_bytes > budget_bytes && !plan.keep.is_empty() {
             break;
         }
@@ -182,8 +184,8 @@ impl Search<'_> {
         if resident && region.initial {
             return;
         }
-        let chunk = region.chunk;
-        let found = Ahead { chunk, frames, probability, resident };
+        let (chunk, decoded_bytes) = (region.chunk, decoded_bytes(self.version.listing(), region));
+        let found = Ahead { chunk, decoded_bytes, frames, probability, resident };
         let known = self.found.entry(chunk.hash).or_insert(found);
         known.frames = known.frames.min(frames);
         known.probability = known.probability.max(probability);
@@ -237,8 +239,9 @@ mod tests {
     #[test]
     fn a_plan_takes_what_fits_and_never_nothing() {
         let chunk = |id: u8, resident| {
-            let chunk = ChunkRef { hash: ChunkHash([id; 32]), bytes: 100 };
-            Ahead { chunk, frames: 0, probability: 1.0, resident }
+            // What travels is a tenth of what is held.
+            let chunk = ChunkRef { hash: ChunkHash([id; 32]), bytes: 10 };
+            Ahead { chunk, decoded_bytes: 100, frames: 0, probability: 1.0, resident }
         };
         let all = [chunk(1, true), chunk(2, false), chunk(3, false)];
         let plan_250 = plan(&all, 250);

@@ -80,65 +80,102 @@ impl Scene {
         self.poses.len()
     }
 
+    /// Whether a pose is of this scene: one of another version may not be. Below, those that are not are
+    /// the caller's mistake, for these are called many times a frame.
+    pub fn has(&self, pose: PoseId) -> bool {
+        pose.index() < self.poses.len()
+    }
+
     /// All edges, by id; sorted by source, then target.
     pub fn edges(&self) -> &[Edge] {
         &self.edges
     }
 
     /// The clip of a pose; for a pose of a transition, the clip that it leads to.
+    ///
+    /// # Panics
+    /// If the pose is not of this scene.
     pub fn clip_of(&self, pose: PoseId) -> u16 {
         self.poses[pose.index()].clip
     }
 
     /// The frame of a pose in its clip.
+    ///
+    /// # Panics
+    /// If the pose is not of this scene.
     pub fn frame_of(&self, pose: PoseId) -> u32 {
         self.poses[pose.index()].frame
     }
 
     /// Whether the pose was made for a transition.
+    ///
+    /// # Panics
+    /// If the pose is not of this scene.
     pub fn is_transition(&self, pose: PoseId) -> bool {
         self.poses[pose.index()].transition
     }
 
     /// Out-edges of a pose: consecutive ids, never empty.
+    ///
+    /// # Panics
+    /// If the pose is not of this scene.
     pub fn out_edges(&self, pose: PoseId) -> impl DoubleEndedIterator<Item = EdgeId> + use<> {
         (self.first_edge[pose.index()]..self.first_edge[pose.index() + 1]).map(EdgeId)
     }
 
     /// How many edges leave a pose.
+    ///
+    /// # Panics
+    /// If the pose is not of this scene.
     pub fn out_degree(&self, pose: PoseId) -> usize {
         (self.first_edge[pose.index() + 1] - self.first_edge[pose.index()]) as usize
     }
 
     /// The edge from one pose to another, or `None` where `to` is no successor.
     pub fn edge_between(&self, from: PoseId, to: PoseId) -> Option<EdgeId> {
-        self.out_edges(from).find(|edge| self.edges[edge.index()].to == to)
+        let out_edges = self.has(from).then(|| self.out_edges(from));
+        out_edges?.find(|edge| self.edges[edge.index()].to == to)
     }
 
     /// Position of an edge among the out-edges of its source: the index into a link entry.
+    ///
+    /// # Panics
+    /// If the edge is not of this scene.
     pub fn slot(&self, edge: EdgeId) -> usize {
         (edge.0 - self.first_edge[self.edges[edge.index()].from.index()]) as usize
     }
 
     /// Moves the target's clip into the world of the source's clip.
+    ///
+    /// # Panics
+    /// If the edge is not of this scene.
     pub fn alignment(&self, edge: EdgeId) -> Rigid {
         let Edge { yaw, shift, .. } = self.edges[edge.index()];
         Rigid::from_yaw(yaw, Vec3::new(shift[0], 0.0, shift[1]))
     }
 
     /// The hips in the world of the pose's clip: the state frame.
+    ///
+    /// # Panics
+    /// If the pose is not of this scene.
     pub fn hips(&self, pose: PoseId) -> Rigid {
         let pose = &self.poses[pose.index()];
         Rigid { rotation: rotation(pose.rotations[0]), translation: pose.root }
     }
 
     /// A pose in the world of its clip, for skinning.
+    ///
+    /// # Panics
+    /// If the pose is not of this scene.
     pub fn pose(&self, pose: PoseId) -> Pose {
         let pose = &self.poses[pose.index()];
         Pose { root: pose.root, rotations: pose.rotations.iter().map(|q| rotation(*q)).collect() }
     }
 
     /// As [`Scene::pose`], into a pose that keeps its memory.
+    ///
+    /// # Panics
+    /// If the pose is not of this scene.
     pub fn pose_into(&self, pose: PoseId, out: &mut Pose) {
         let pose = &self.poses[pose.index()];
         out.root = pose.root;
@@ -218,6 +255,10 @@ mod tests {
         let edge = scene.edge_between(PoseId(1), PoseId(0)).unwrap();
         assert_eq!((edge, scene.slot(edge)), (EdgeId(2), 0));
         assert_eq!(scene.edge_between(PoseId(1), PoseId(1)), None);
+        assert!(scene.has(PoseId(1)) && !scene.has(PoseId(2)));
+        assert_eq!(scene.edge_between(PoseId(2), PoseId(1)), None);
+        let mut steer = crate::Steer::new(&std::sync::Arc::new(scene));
+        assert_eq!((steer.next(PoseId(2), 0), steer.frames_to(PoseId(2), 0)), (None, None));
     }
 
     #[test]

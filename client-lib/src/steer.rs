@@ -36,9 +36,12 @@ impl Steer {
 
     /// The pose after `pose` on the way to `clip`, and on through it once it is reached: the clip is
     /// played to its end, then entered again by the shortest way. `None` where no way leads there,
-    /// or there is no such clip.
+    /// or there is no such clip or pose.
     pub fn next(&mut self, pose: PoseId, clip: u16) -> Option<PoseId> {
         let scene = Arc::clone(&self.scene);
+        if !scene.has(pose) {
+            return None;
+        }
         if scene.clip_of(pose) == clip
             && !scene.is_transition(pose)
             && let Some(next) = next_in_clip(&scene, pose)
@@ -52,9 +55,9 @@ impl Steer {
     }
 
     /// Frames from `pose` until the clip is entered at a recorded pose; 0 where one is in it already.
-    /// `None` where no way leads there, or there is no such clip.
+    /// `None` where no way leads there, or there is no such clip or pose.
     pub fn frames_to(&mut self, pose: PoseId, clip: u16) -> Option<u32> {
-        let frames = self.distances(clip)?[pose.index()];
+        let frames = *self.distances(clip)?.get(pose.index())?;
         (frames != u32::MAX).then_some(frames)
     }
 

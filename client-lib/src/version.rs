@@ -10,7 +10,7 @@ use protocol::scene::GarmentChunk;
 use protocol::table::Entry;
 use protocol::{ChunkHash, GarmentId, LinkTable, NotTotal, PoseId, StateId, VersionNumber};
 
-use crate::cache::Resident;
+use crate::cache::{Region, Resident};
 use crate::free::Upsampled;
 use crate::free::probe::Probes;
 use crate::scene::Scene;
@@ -170,6 +170,13 @@ impl Version {
         }
         states * 32 + links * size_of::<StateId>()
     }
+}
+
+/// About what a region chunk takes in memory once it is decoded, in bytes.
+pub fn decoded_bytes(garment: &GarmentVersion, region: &RegionChunkRef) -> usize {
+    let columns =
+        garment.generations.iter().map(|generation| usize::from(generation.columns)).sum();
+    Region::bytes_expected(region.state_count as usize, columns)
 }
 
 /// What a character plays from: a version and the coefficients that are resident.

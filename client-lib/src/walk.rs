@@ -114,7 +114,7 @@ enum Kind {
 }
 
 impl Walk {
-    /// A walk from `start`.
+    /// A walk from `start`; over at once where the scene has no such pose.
     ///
     /// # Errors
     /// Clips that do not exist or cannot be reached; lines that name nothing.
@@ -138,6 +138,9 @@ impl Iterator for Walk {
 
     fn next(&mut self) -> Option<PoseId> {
         let scene = &self.scene;
+        if !scene.has(self.pose) {
+            return None;
+        }
         let next = match &mut self.kind {
             Kind::Random(random) => {
                 let degree = scene.out_degree(self.pose) as u64;
@@ -233,6 +236,9 @@ fn shortest_way(
     from: PoseId,
     is_goal: impl Fn(PoseId) -> bool,
 ) -> Option<Vec<PoseId>> {
+    if !scene.has(from) {
+        return None;
+    }
     let mut came_from: Vec<Option<PoseId>> = vec![None; scene.pose_count()];
     let mut open = VecDeque::from([from]);
     while let Some(pose) = open.pop_front() {

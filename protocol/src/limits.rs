@@ -47,11 +47,16 @@ pub const TOKEN_BYTES_MAX: usize = 1024;
 pub const REASON_BYTES_MAX: usize = 1024;
 /// Edges in one telemetry message; a client splits what is longer.
 pub const TELEMETRY_EDGES_MAX: usize = 4096;
-/// Traversals per second that one client adds to the counts; what is above is dropped, so that
-/// nobody steers the exploration alone. Eight characters at 30 frames per second.
+/// Traversals per second that one client adds to the counts, and outcomes of steps; what is above is
+/// dropped, so that nobody steers the exploration alone. Eight characters at 30 frames per second.
 pub const TRAVERSALS_PER_SECOND_MAX: u32 = 240;
 /// Traversals that a client may save up while it is silent.
 pub const TRAVERSALS_BURST_MAX: u32 = 60 * TRAVERSALS_PER_SECOND_MAX;
+/// Versions per second that one client may pin, and how many it may save up: each is read from the
+/// store, and sent whole.
+pub const PINS_PER_SECOND_MAX: u32 = 2;
+/// See [`PINS_PER_SECOND_MAX`].
+pub const PINS_BURST_MAX: u32 = 16;
 /// Tags per second that a server takes from one client, and how many it may save up.
 pub const TAGS_PER_SECOND_MAX: u32 = 2;
 /// See [`TAGS_PER_SECOND_MAX`].

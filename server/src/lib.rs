@@ -9,7 +9,8 @@
 //!
 //! Map: `store` reading, verified; `versions` notices new ones; `quic` the endpoint; `session` one
 //! player; `http` health, metrics, status, chunks, the live page; `telemetry` counts into the
-//! store; `tags` too; `identity` the certificate; `socket` counts stray datagrams.
+//! store; `tags` too; `identity` the certificate; `socket` counts stray datagrams; `throttle` keeps the
+//! log short.
 //!
 //! ```no_run
 //! # async fn run() -> Result<(), Box<dyn std::error::Error>> {
@@ -36,6 +37,7 @@ mod stats;
 mod store;
 mod tags;
 mod telemetry;
+mod throttle;
 mod versions;
 
 use std::collections::BTreeMap;
@@ -46,7 +48,7 @@ use std::time::{Duration, Instant};
 
 use object_store::ObjectStore;
 use tokio::net::TcpListener;
-use tokio::sync::{Notify, watch};
+use tokio::sync::{Notify, Semaphore, watch};
 use tokio::task::JoinSet;
 
 pub use identity::IdentityError;
@@ -165,6 +167,10 @@ impl Server {
             counts: Mutex::default(),
             players: Mutex::new(BTreeMap::new()),
             history: Mutex::default(),
+            deliveries: Arc::default(),
+            logs: throttle::Logs::default(),
+            unlisted: Semaphore::new(shared::UNLISTED_MAX),
+            failing: Mutex::default(),
         });
         let mut tasks = JoinSet::new();
         if let Some(listener) = listener {
@@ -205,18 +211,21 @@ impl Server {
         self.shared.look.notify_one();
     }
 
-    /// Tells every player, writes what was counted, closes the ports.
+    /// Tells every player, writes what was counted, closes the ports. Takes at most about ten seconds,
+    /// whatever players and the store do.
     pub async fn shutdown(mut self) {
         const PATIENCE: Duration = Duration::from_secs(3);
         self.shared.stop.send_replace(true);
         let ended = async { while self.tasks.join_next().await.is_some() {} };
         if tokio::time::timeout(PATIENCE, ended).await.is_err() {
             tracing::warn!("some connections did not end in time");
-            self.tasks.abort_all();
+            self.tasks.shutdown().await;
         }
-        telemetry::write(&self.shared, &mut 0).await;
         let code = protocol::message::CloseCode::ShuttingDown.number();
         self.endpoint.close(quinn::VarInt::from_u32(code), b"the server is going down");
+        if tokio::time::timeout(PATIENCE, telemetry::write(&self.shared)).await.is_err() {
+            tracing::warn!("the store did not take the last counts in time: they are lost");
+        }
         let port_freed = async {
             self.endpoint.wait_idle().await;
             drop(self.endpoint);

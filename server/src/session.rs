@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use bytes::Bytes;
 use protocol::frame::chunk_head;
 use protocol::message::{CloseCode, Priority, TagOutcome, Telemetry};
 use protocol::session::{Server as Machine, ServerConfig, ServerEvent};
@@ -24,13 +25,23 @@ const URGENT_SENDS_MAX: usize = 24;
 const READ_BYTES: usize = 16 << 10;
 /// How long the last words may take.
 const LAST_WORDS: Duration = Duration::from_millis(500);
+/// A store that fails is asked again after these pauses; then the session ends, and the client comes
+/// back.
+const STORE_PAUSES: [Duration; 4] = [
+    Duration::from_millis(100),
+    Duration::from_millis(200),
+    Duration::from_millis(400),
+    Duration::from_millis(800),
+];
 
 /// Serves one player until either side ends it.
 pub(crate) async fn serve(shared: Arc<Shared>, connection: Connection) {
     let limit = Duration::from_micros(limits::HANDSHAKE_US_MAX);
     let Ok(streams) = tokio::time::timeout(limit, connection.accept_bi()).await else {
         shared.metrics.broken_sessions.inc();
-        tracing::warn!(from = %connection.remote_address(), "no control stream in time");
+        if let Some(more) = shared.logs.sessions.may_write() {
+            tracing::warn!(from = %connection.remote_address(), more, "no control stream in time");
+        }
         let code = CloseCode::HandshakeTimeout.number();
         return connection.close(VarInt::from_u32(code), b"no control stream in time");
     };
@@ -40,12 +51,14 @@ pub(crate) async fn serve(shared: Arc<Shared>, connection: Connection) {
     let _ = control.set_priority(i32::MAX);
     let (token, tag_token) = (shared.token.clone(), shared.tag_token.clone());
     let machine = Machine::new(ServerConfig { token, tag_token }, shared.now());
+    let machine = machine.sharing(shared.deliveries.clone());
     let session = Session {
         shared,
         connection,
         machine,
         player: None,
-        unsent: Vec::new(),
+        unsent: Arc::default(),
+        sent: 0,
         waiting: BTreeSet::new(),
         sending: HashMap::new(),
         tasks: JoinSet::new(),
@@ -61,8 +74,9 @@ struct Session {
     machine: Machine,
     /// Once let in.
     player: Option<Player>,
-    /// For the control stream.
-    unsent: Vec<u8>,
+    /// For the control stream, which has taken this much of it.
+    unsent: Arc<[u8]>,
+    sent: usize,
     /// Chunks asked for, not yet being sent.
     waiting: BTreeSet<(Priority, u64, ChunkHash)>,
     sending: HashMap<ChunkHash, Sending>,
@@ -81,7 +95,17 @@ enum Done {
     Base(Option<Arc<SignedManifest>>),
     Pinned(VersionNumber, Option<Arc<SignedManifest>>),
     Tagged(GarmentId, StateId, TagOutcome),
-    Chunk { hash: ChunkHash, serial: u64, found: bool },
+    Chunk { hash: ChunkHash, serial: u64, sent: Sent },
+}
+
+/// What became of a chunk.
+enum Sent {
+    /// It is on its way whole, or the connection or the wish for it is gone.
+    Whole,
+    /// There is no such chunk, or only a damaged one.
+    Missing,
+    /// The store failed, again and again.
+    Failed,
 }
 
 impl Session {
@@ -105,9 +129,9 @@ impl Session {
                     Ok(None) => self.machine.close(CloseCode::Done, "the control stream ended"),
                     Err(_) => return,
                 },
-                written = control.write(&self.unsent), if !self.unsent.is_empty() => {
+                written = control.write(&self.unsent[self.sent..]), if !self.is_written() => {
                     let Ok(count) = written else { return };
-                    self.unsent.drain(..count);
+                    self.sent += count;
                     self.shared.metrics.bytes_sent.inc_by(count as u64);
                 }
                 Some(done) = self.tasks.join_next(), if !self.tasks.is_empty() => {
@@ -137,11 +161,16 @@ impl Session {
             self.handle(event);
         }
         self.start_sends();
-        if self.unsent.is_empty()
+        if self.is_written()
             && let Some(bytes) = self.machine.poll_transmit()
         {
-            self.unsent = bytes;
+            (self.unsent, self.sent) = (bytes, 0);
         }
+    }
+
+    /// Whether the control stream has taken all there was.
+    fn is_written(&self) -> bool {
+        self.sent == self.unsent.len()
     }
 
     fn handle(&mut self, event: ServerEvent) {
@@ -240,8 +269,12 @@ impl Session {
             self.sending.insert(hash, Sending { serial, _cancel: cancel });
             let (shared, connection) = (self.shared.clone(), self.connection.clone());
             self.tasks.spawn(async move {
-                let found = send(&shared, &connection, &hash, priority, cancelled).await;
-                Done::Chunk { hash, serial, found }
+                // Whatever it waits for: a place that is given up must hold nothing.
+                let sent = tokio::select! {
+                    sent = send(&shared, &connection, &hash, priority) => sent,
+                    _ = cancelled => Sent::Whole,
+                };
+                Done::Chunk { hash, serial, sent }
             });
         }
     }
@@ -253,13 +286,16 @@ impl Session {
             Done::Tagged(garment, state, outcome) => {
                 self.machine.handle_tagged(garment, state, outcome);
             }
-            Done::Chunk { hash, serial, found } => {
+            Done::Chunk { hash, serial, sent } => {
                 // A cancelled chunk may be on its way a second time already.
                 if self.sending.get(&hash).is_some_and(|sending| sending.serial == serial) {
                     self.sending.remove(&hash);
-                    match found {
-                        true => self.machine.handle_sent(&hash),
-                        false => self.machine.handle_missing(&hash),
+                    match sent {
+                        Sent::Whole => self.machine.handle_sent(&hash),
+                        Sent::Missing => self.machine.handle_missing(&hash),
+                        Sent::Failed => {
+                            self.machine.close(CloseCode::Internal, "the store cannot be read");
+                        }
                     }
                 }
             }
@@ -283,20 +319,31 @@ impl Session {
     async fn say_last_words(mut self, control: &mut SendStream) {
         let (code, message) = self.closed.take().expect("the machine has closed");
         let from = self.connection.remote_address();
+        let logs = &self.shared.logs.sessions;
         match code {
             CloseCode::Done | CloseCode::ShuttingDown => tracing::debug!(%from, "{message}"),
             CloseCode::TokenRefused => {
                 self.shared.metrics.refused_tokens.inc();
-                tracing::warn!(%from, "refused: {message}");
+                if let Some(more) = logs.may_write() {
+                    tracing::warn!(%from, more, "refused: {message}");
+                }
             }
-            CloseCode::Full => tracing::warn!(%from, "refused: {message}"),
+            CloseCode::Full => {
+                if let Some(more) = logs.may_write() {
+                    tracing::warn!(%from, more, "refused: {message}");
+                }
+            }
+            // Our own fault: it was counted and said where the store failed.
+            CloseCode::Internal => tracing::debug!(%from, "session ended: {message}"),
             _ => {
                 self.shared.metrics.broken_sessions.inc();
-                tracing::warn!(%from, ?code, "session ended: {message}");
+                if let Some(more) = logs.may_write() {
+                    tracing::warn!(%from, ?code, more, "session ended: {message}");
+                }
             }
         }
         let last_words = async {
-            control.write_all(&self.unsent).await?;
+            control.write_all(&self.unsent[self.sent..]).await?;
             while let Some(bytes) = self.machine.poll_transmit() {
                 control.write_all(&bytes).await?;
             }
@@ -311,56 +358,83 @@ impl Session {
     }
 }
 
-/// Sends a chunk on a stream of its own; says whether there was such a chunk.
+/// Sends a chunk on a stream of its own. Dropped on the way, it resets the stream.
 async fn send(
     shared: &Shared,
     connection: &Connection,
     hash: &ChunkHash,
     priority: Priority,
-    mut cancelled: oneshot::Receiver<()>,
-) -> bool {
-    let bytes = match shared.source.chunk(hash).await {
+) -> Sent {
+    let bytes = match read(shared, hash).await {
         Ok(bytes) => bytes,
-        Err(error) => {
-            count_failure(shared, &error);
-            return false;
-        }
+        Err(ReadError::Store { .. }) => return Sent::Failed,
+        Err(_) => return Sent::Missing,
     };
-    let Ok(mut stream) = connection.open_uni().await else { return true };
-    let _ = stream.set_priority(-(priority as i32));
+    let Ok(stream) = connection.open_uni().await else { return Sent::Whole };
+    let mut stream = ChunkStream { stream, is_whole: false };
+    let _ = stream.stream.set_priority(-(priority as i32));
     let head = chunk_head(hash, bytes.len() as u32);
     let payload = head.len() + bytes.len();
-    let write = async {
-        stream.write_all(&head).await?;
-        stream.write_chunk(bytes).await
+    let written = async {
+        stream.stream.write_all(&head).await?;
+        stream.stream.write_chunk(bytes).await
     };
-    let written = tokio::select! {
-        written = write => Some(written),
-        _ = &mut cancelled => None,
-    };
-    match written {
-        Some(Ok(())) => {
-            let _ = stream.finish();
-            shared.metrics.chunks_sent.inc();
-            shared.metrics.bytes_sent.inc_by(payload as u64);
-        }
-        // The connection or the stream is gone.
-        Some(Err(_)) => {}
-        // Dropping it would end it as if it were whole.
-        None => drop(stream.reset(VarInt::from_u32(CloseCode::Done.number()))),
+    // Where it fails, the connection or the stream is gone.
+    if written.await.is_ok() {
+        stream.is_whole = true;
+        let _ = stream.stream.finish();
+        shared.metrics.chunks_sent.inc();
+        shared.metrics.bytes_sent.inc_by(payload as u64);
     }
-    true
+    Sent::Whole
+}
+
+/// Reads a chunk; has patience with a store that fails.
+async fn read(shared: &Shared, hash: &ChunkHash) -> Result<Bytes, ReadError> {
+    let mut pauses = STORE_PAUSES.into_iter();
+    loop {
+        let read = shared.chunk(hash).await;
+        if let Err(error) = &read {
+            count_failure(shared, error);
+        }
+        let pause = match &read {
+            Err(ReadError::Store { .. }) => pauses.next(),
+            _ => None,
+        };
+        let Some(pause) = pause else { return read };
+        tokio::time::sleep(pause).await;
+    }
+}
+
+/// A stream that was not written to its end is reset: dropping it would end it as if it were whole.
+struct ChunkStream {
+    stream: SendStream,
+    is_whole: bool,
+}
+
+impl Drop for ChunkStream {
+    fn drop(&mut self) {
+        if !self.is_whole {
+            let _ = self.stream.reset(VarInt::from_u32(CloseCode::Done.number()));
+        }
+    }
 }
 
 /// Counts and logs why a chunk was not served.
 pub(crate) fn count_failure(shared: &Shared, error: &ReadError) {
     let counter = match error {
-        ReadError::Missing(_) => &shared.metrics.chunks_missing,
+        ReadError::Missing(_) => {
+            shared.metrics.chunks_missing.inc();
+            // Anybody may ask for any hash.
+            return tracing::debug!(%error, "chunk not served");
+        }
         ReadError::Corrupted { .. } => &shared.metrics.chunks_corrupted,
         _ => &shared.metrics.store_failures,
     };
     counter.inc();
-    tracing::warn!(%error, "chunk not served");
+    if let Some(more) = shared.logs.chunks.may_write() {
+        tracing::warn!(%error, more, "chunk not served");
+    }
 }
 
 /// A place among the players, left when dropped.

@@ -1,21 +1,28 @@
 //! What all tasks of a server share.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use protocol::session::Time;
-use protocol::{GarmentId, PublisherKey, SignedManifest, StateId, VersionNumber};
+use bytes::Bytes;
+use protocol::session::{Deliveries, Time};
+use protocol::{ChunkHash, GarmentId, PublisherKey, SignedManifest, StateId, VersionNumber};
 use std::sync::Arc;
-use tokio::sync::{Notify, watch};
+use tokio::sync::{Notify, Semaphore, watch};
 
 use crate::metrics::Metrics;
 use crate::stats::{GarmentStats, Outcomes, Stats, VersionPoint};
-use crate::store::Source;
+use crate::store::{ReadError, Source};
 use crate::telemetry::Counts;
+use crate::throttle::Logs;
 
 /// Versions that the live page plots.
 const HISTORY_MAX: usize = 2000;
+/// Chunks that no known version lists and that are looked up at the same time.
+pub(crate) const UNLISTED_MAX: usize = 8;
+/// How long one of these that is not there keeps its place: with [`UNLISTED_MAX`], the store is asked for
+/// at most 160 names a second that it does not have.
+const UNLISTED_PAUSE: Duration = Duration::from_millis(50);
 
 #[derive(Debug)]
 pub(crate) struct Shared {
@@ -33,6 +40,12 @@ pub(crate) struct Shared {
     pub counts: Mutex<Counts>,
     pub players: Mutex<BTreeMap<u64, Option<VersionNumber>>>,
     pub history: Mutex<Vec<VersionPoint>>,
+    pub deliveries: Arc<Deliveries>,
+    pub logs: Logs,
+    /// Places for looking up what no known version lists.
+    pub unlisted: Semaphore,
+    /// Why the last look for new versions failed.
+    pub failing: Mutex<Option<String>>,
 }
 
 /// What is served.
@@ -40,6 +53,8 @@ pub(crate) struct Shared {
 pub(crate) struct Head {
     pub publisher: Option<PublisherKey>,
     pub signed: Option<Arc<SignedManifest>>,
+    /// All chunks that it lists.
+    pub listed: Arc<HashSet<ChunkHash>>,
 }
 
 impl Shared {
@@ -64,7 +79,41 @@ impl Shared {
         });
         drop(history);
         tracing::info!(version = number.0, "a new head");
-        self.head.send_modify(|head| head.signed = Some(signed));
+        let listed = Arc::new(listed(&signed));
+        self.head.send_modify(|head| {
+            head.signed = Some(signed);
+            head.listed = listed;
+        });
+    }
+
+    /// A chunk, verified. Anybody may ask for any hash: what neither the head nor a version that
+    /// somebody wanted lately lists may still be of an old one, and is looked up, but few at a time.
+    pub async fn chunk(&self, hash: &ChunkHash) -> Result<Bytes, ReadError> {
+        if let Some(bytes) = self.source.cached(hash) {
+            return Ok(bytes);
+        }
+        if self.head.borrow().listed.contains(hash) || self.source.lists(hash) {
+            return self.source.chunk(hash).await;
+        }
+        // Never closed; without a place it would be read all the same.
+        let _place = self.unlisted.acquire().await;
+        let read = self.source.chunk(hash).await;
+        if read.is_err() {
+            tokio::time::sleep(UNLISTED_PAUSE).await;
+        }
+        read
+    }
+
+    /// Why no player could play now.
+    pub fn lacks(&self) -> Option<String> {
+        if *self.stop.borrow() {
+            return Some("the server is going down".into());
+        }
+        if let Some(why) = &*lock(&self.failing) {
+            return Some(format!("the store cannot be read: {why}"));
+        }
+        let head = self.head.borrow();
+        head.signed.is_none().then(|| "the store has no version to serve".into())
     }
 
     /// Edges of a garment's primary graph in the head, if it is there.
@@ -121,6 +170,12 @@ impl Shared {
             history: lock(&self.history).clone(),
         }
     }
+}
+
+/// All chunks of a version.
+pub(crate) fn listed(signed: &SignedManifest) -> HashSet<ChunkHash> {
+    let garments = signed.manifest.garments.iter();
+    garments.flat_map(|garment| garment.chunks()).map(|chunk| chunk.hash).collect()
 }
 
 /// A panic of another task while it held the lock leaves plain numbers behind: go on with them.

@@ -1,6 +1,6 @@
 //! Reading the store: head, manifests, chunks. Nothing is served that is not what its name says.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
@@ -11,6 +11,8 @@ use protocol::manifest::ManifestError;
 use tokio::sync::OnceCell;
 
 use protocol::{ChunkHash, PublisherKey, SignedManifest, VersionNumber, limits, store};
+
+use crate::shared::listed;
 
 /// Why something was not read from the store.
 #[derive(Debug, thiserror::Error)]
@@ -62,11 +64,54 @@ pub(crate) struct Source {
     store: Arc<dyn ObjectStore>,
     cache: Mutex<Cache>,
     reads: Reads,
+    /// Versions read lately: many players come back with the same one.
+    versions: Mutex<VecDeque<Known>>,
+    telemetry: Numbers,
+    tags: Numbers,
+}
+
+/// Versions that are kept after they were read.
+const VERSIONS_KEPT: usize = 4;
+/// How often a number that another server took first is tried again.
+const TRIES: u32 = 16;
+
+/// A version and what it lists.
+#[derive(Debug)]
+struct Known {
+    signed: Arc<SignedManifest>,
+    listed: HashSet<ChunkHash>,
+}
+
+/// A folder of numbered objects that are only ever added.
+#[derive(Debug)]
+struct Numbers {
+    folder: &'static str,
+    path: fn(u64) -> String,
+    number: fn(&str) -> Option<u64>,
+    /// The newest one known; `None` before the folder was listed.
+    newest: tokio::sync::Mutex<Option<u64>>,
+}
+
+impl Numbers {
+    fn new(folder: &'static str, path: fn(u64) -> String, number: fn(&str) -> Option<u64>) -> Self {
+        Self { folder, path, number, newest: tokio::sync::Mutex::default() }
+    }
 }
 
 impl Source {
     pub fn new(store: Arc<dyn ObjectStore>, cache_bytes_max: usize) -> Self {
-        Self { store, cache: Mutex::new(Cache::new(cache_bytes_max)), reads: Reads::default() }
+        Self {
+            store,
+            cache: Mutex::new(Cache::new(cache_bytes_max)),
+            reads: Reads::default(),
+            versions: Mutex::default(),
+            telemetry: Numbers::new(
+                store::TELEMETRY,
+                store::telemetry_path,
+                store::telemetry_of_path,
+            ),
+            tags: Numbers::new(store::TAGS, store::tag_path, store::tag_of_path),
+        }
     }
 
     /// All versions above `after`, newest first, by listing.
@@ -82,26 +127,44 @@ impl Source {
         Ok(numbers)
     }
 
-    /// The newest batch of telemetry, 0 for none.
-    pub async fn newest_telemetry(&self) -> Result<u64, ReadError> {
-        let paths = self.paths(store::TELEMETRY, None).await?;
-        Ok(paths.iter().filter_map(|path| store::telemetry_of_path(path)).max().unwrap_or(0))
+    /// Creates a tag under the next free number and says which; `None` where others took all that
+    /// were tried.
+    pub async fn add_tag(&self, bytes: &[u8]) -> Result<Option<u64>, ReadError> {
+        self.add(&self.tags, bytes).await
     }
 
-    /// The newest tag, 0 for none.
-    pub async fn newest_tag(&self) -> Result<u64, ReadError> {
-        let paths = self.paths(store::TAGS, None).await?;
-        Ok(paths.iter().filter_map(|path| store::tag_of_path(path)).max().unwrap_or(0))
+    /// Creates a batch of telemetry, as [`Source::add_tag`].
+    pub async fn add_telemetry(&self, bytes: &[u8]) -> Result<Option<u64>, ReadError> {
+        self.add(&self.telemetry, bytes).await
     }
 
-    /// Creates a tag; `false` if that number is taken.
-    pub async fn create_tag(&self, number: u64, bytes: Vec<u8>) -> Result<bool, ReadError> {
-        self.create(store::tag_path(number), bytes).await
+    /// Lists the folder once, then only what was added by others since: a world runs for years.
+    async fn add(&self, numbers: &Numbers, bytes: &[u8]) -> Result<Option<u64>, ReadError> {
+        let mut newest = numbers.newest.lock().await;
+        for _ in 0..TRIES {
+            let after = match *newest {
+                None => self.newest_after(numbers, 0).await?,
+                Some(known) => known,
+            };
+            let next = after + 1;
+            // Not known unless all goes well: a number must neither be left out nor taken twice.
+            *newest = None;
+            if self.create((numbers.path)(next), bytes.to_vec()).await? {
+                *newest = Some(next);
+                return Ok(Some(next));
+            }
+            // Another server of this store was faster.
+            *newest = Some(self.newest_after(numbers, next).await?);
+        }
+        Ok(None)
     }
 
-    /// Creates a batch of telemetry; `false` if that number is taken.
-    pub async fn create_telemetry(&self, number: u64, bytes: Vec<u8>) -> Result<bool, ReadError> {
-        self.create(store::telemetry_path(number), bytes).await
+    /// The newest number in a folder, at least `known`; what lies before that is not listed.
+    async fn newest_after(&self, numbers: &Numbers, known: u64) -> Result<u64, ReadError> {
+        let after = (known > 0).then(|| (numbers.path)(known));
+        let paths = self.paths(numbers.folder, after).await?;
+        let newest = paths.iter().filter_map(|path| (numbers.number)(path)).max();
+        Ok(newest.unwrap_or(0).max(known))
     }
 
     async fn create(&self, path: String, bytes: Vec<u8>) -> Result<bool, ReadError> {
@@ -126,6 +189,9 @@ impl Source {
         number: VersionNumber,
         publisher: &PublisherKey,
     ) -> Result<Option<Arc<SignedManifest>>, ReadError> {
+        if let Some(known) = self.known(number) {
+            return Ok(Some(known));
+        }
         let Some(bytes) = self.read(&store::version_path(number)).await? else { return Ok(None) };
         let bad = |error: ManifestError| ReadError::BadManifest { number, why: error.to_string() };
         let signed = SignedManifest::open(&bytes, publisher).map_err(bad)?;
@@ -134,7 +200,34 @@ impl Source {
             let why = format!("it holds the manifest of version {found}");
             return Err(ReadError::BadManifest { number, why });
         }
-        Ok(Some(Arc::new(signed)))
+        let signed = Arc::new(signed);
+        let known = Known { signed: signed.clone(), listed: listed(&signed) };
+        let mut versions = self.lock_versions();
+        versions.retain(|known| known.signed.manifest.number != number);
+        versions.push_back(known);
+        if versions.len() > VERSIONS_KEPT {
+            versions.pop_front();
+        }
+        Ok(Some(signed))
+    }
+
+    fn known(&self, number: VersionNumber) -> Option<Arc<SignedManifest>> {
+        let mut versions = self.lock_versions();
+        let at = versions.iter().position(|known| known.signed.manifest.number == number)?;
+        let known = versions.remove(at)?;
+        let signed = known.signed.clone();
+        versions.push_back(known);
+        Some(signed)
+    }
+
+    /// Whether a version that was read lately lists a chunk.
+    pub fn lists(&self, hash: &ChunkHash) -> bool {
+        self.lock_versions().iter().any(|known| known.listed.contains(hash))
+    }
+
+    /// A chunk, where it is in memory.
+    pub fn cached(&self, hash: &ChunkHash) -> Option<Bytes> {
+        self.lock().get(hash)
     }
 
     /// A chunk, verified against its name. Whoever asks while it is being read waits for that
@@ -182,6 +275,10 @@ impl Source {
 
     fn lock(&self) -> std::sync::MutexGuard<'_, Cache> {
         self.cache.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn lock_versions(&self) -> std::sync::MutexGuard<'_, VecDeque<Known>> {
+        self.versions.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

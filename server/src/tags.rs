@@ -5,16 +5,12 @@ use protocol::tag::Tag;
 use protocol::{GarmentId, StateId};
 
 use crate::shared::Shared;
-use crate::store::ReadError;
-
-/// How often a number that another server took first is tried again.
-const TRIES: u32 = 16;
 
 /// Keeps a tag under the next free number.
 pub(crate) async fn keep(shared: &Shared, garment: GarmentId, state: StateId) -> TagOutcome {
     let Some(version) = shared.has_state(garment, state) else { return TagOutcome::Unknown };
     let bytes = Tag { garment, state, version }.encode();
-    match create(shared, &bytes).await {
+    match shared.source.add_tag(&bytes).await {
         Ok(Some(number)) => {
             tracing::info!(number, %garment, %state, %version, "a merge was tagged");
             TagOutcome::Kept { number }
@@ -26,14 +22,4 @@ pub(crate) async fn keep(shared: &Shared, garment: GarmentId, state: StateId) ->
             TagOutcome::Failed
         }
     }
-}
-
-async fn create(shared: &Shared, bytes: &[u8]) -> Result<Option<u64>, ReadError> {
-    for _ in 0..TRIES {
-        let number = shared.source.newest_tag().await? + 1;
-        if shared.source.create_tag(number, bytes.to_vec()).await? {
-            return Ok(Some(number));
-        }
-    }
-    Ok(None)
 }

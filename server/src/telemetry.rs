@@ -1,6 +1,7 @@
 //! Traversals of all players together, left in the store in batches.
 
 use std::collections::BTreeMap;
+use std::sync::Mutex;
 use std::time::Duration;
 
 use protocol::message::Telemetry;
@@ -88,44 +89,43 @@ impl Counts {
 /// Writes a batch every `interval`, until the end.
 pub(crate) async fn keep_writing(shared: &Shared, interval: Duration) {
     let mut stop = shared.stop.subscribe();
-    let mut number = 0;
     loop {
         tokio::select! {
             _ = stop.wait_for(|stop| *stop) => break,
             () = tokio::time::sleep(interval) => {}
         }
-        write(shared, &mut number).await;
+        write(shared).await;
     }
 }
 
-/// Writes what was counted, if anything, under the next free number. What the store refuses is
-/// kept for the next time.
-pub(crate) async fn write(shared: &Shared, number: &mut u64) {
+/// Writes what was counted, if anything, under the next free number. What the store refuses, or does
+/// not take before this is dropped, is kept for the next time.
+pub(crate) async fn write(shared: &Shared) {
     let Some(batch) = lock(&shared.counts).take() else { return };
     let bytes = batch.encode();
-    loop {
-        if *number == 0 {
-            match shared.source.newest_telemetry().await {
-                Ok(newest) => *number = newest + 1,
-                Err(error) => return keep(shared, batch, &error),
-            }
-        }
-        match shared.source.create_telemetry(*number, bytes.clone()).await {
-            Ok(true) => {
-                *number += 1;
-                return;
-            }
-            // Another server of this store was faster.
-            Ok(false) => *number = 0,
-            Err(error) => return keep(shared, batch, &error),
+    let mut taken = Taken { counts: &shared.counts, batch: Some(batch) };
+    match shared.source.add_telemetry(&bytes).await {
+        Ok(Some(_)) => taken.batch = None,
+        Ok(None) => tracing::warn!("telemetry is kept for later: others took every number tried"),
+        Err(error) => {
+            tracing::warn!(%error, "telemetry is kept for later");
+            shared.metrics.store_failures.inc();
         }
     }
 }
 
-fn keep(shared: &Shared, batch: TelemetryBatch, error: &crate::store::ReadError) {
-    tracing::warn!(%error, "telemetry is kept for later");
-    shared.metrics.store_failures.inc();
-    lock(&shared.counts).put_back(batch);
+/// A batch that goes back where it came from unless it was written.
+struct Taken<'a> {
+    counts: &'a Mutex<Counts>,
+    batch: Option<TelemetryBatch>,
+}
+
+impl Drop for Taken<'_> {
+    fn drop(&mut self) {
+        if let Some(batch) = self.batch.take() {
+            lock(self.counts).put_back(batch);
+        }
+    }
 }
 
 #[cfg(test)]
@@ -158,5 +158,21 @@ mod tests {
         // A player alone counts in full.
         counts.add(3, &report(&[(2, 7)]), Some(9));
         assert_eq!(edges(&counts.take().unwrap()), [(EdgeId(2), 7)]);
+    }
+
+    #[test]
+    fn what_was_taken_goes_back_unless_it_was_written() {
+        let counts = Mutex::new(Counts::default());
+        lock(&counts).add(1, &report(&[(0, 7)]), Some(9));
+        for _ in 0..3 {
+            let batch = lock(&counts).take();
+            assert_eq!(batch.as_ref().unwrap().garments[0].edges, [(EdgeId(0), 7)]);
+            drop(Taken { counts: &counts, batch });
+        }
+        let batch = lock(&counts).take();
+        let mut taken = Taken { counts: &counts, batch };
+        taken.batch = None;
+        drop(taken);
+        assert_eq!(lock(&counts).take(), None);
     }
 }

@@ -4,12 +4,15 @@ use std::time::Duration;
 
 use protocol::{PublisherKey, VersionNumber};
 
-use crate::shared::Shared;
+use crate::shared::{Shared, lock};
 use crate::store::ReadError;
 
 /// Every so many looks the store is listed, in case numbers were skipped; in between only the next
 /// number is tried, which costs the same however many versions there are.
 const LOOKS_PER_LISTING: u32 = 40;
+
+/// A store that has not answered for so long has failed.
+const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Looks for new versions every `interval`, and whenever `Shared::look` says so.
 pub(crate) async fn watch(shared: &Shared, interval: Duration) {
@@ -36,7 +39,12 @@ struct Looker<'a> {
 
 impl Looker<'_> {
     async fn look(&mut self) {
-        match self.advance().await {
+        let advanced = match tokio::time::timeout(PATIENCE, self.advance()).await {
+            Ok(advanced) => advanced.map_err(|error| error.to_string()),
+            Err(_) => Err(format!("the store has not answered for {PATIENCE:?}")),
+        };
+        *lock(&self.shared.failing) = advanced.as_ref().err().cloned();
+        match advanced {
             Ok(()) if self.failing => {
                 tracing::info!("the store can be read again");
                 self.failing = false;

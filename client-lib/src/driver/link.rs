@@ -1,7 +1,8 @@
 //! Sockets: dials, reads and writes in small tasks, and tells the driver what happened.
 
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
-use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use protocol::limits;
@@ -18,6 +19,8 @@ const READ_BYTES: usize = 64 << 10;
 const IDLE: Duration = Duration::from_secs(10);
 /// How often an idle line is kept alive.
 const KEEP_ALIVE: Duration = Duration::from_secs(3);
+/// How long one of several addresses of a server may take to answer.
+const ATTEMPT: Duration = Duration::from_secs(3);
 /// Name in the TLS handshake; servers are known by their fingerprint, not by it.
 const SERVER_NAME: &str = "toile";
 
@@ -68,15 +71,16 @@ pub struct Dialer {
     pin: Arc<Pin>,
     config: Result<quinn::ClientConfig, String>,
     inputs: mpsc::Sender<Input>,
-    /// One per address family, made when first needed.
-    endpoints: [Option<Endpoint>; 2],
+    endpoints: Endpoints,
+    failures: Arc<AtomicUsize>,
 }
 
 impl Dialer {
     /// `pin`: the certificate to insist on.
     pub fn new(address: String, pin: Option<Fingerprint>, inputs: mpsc::Sender<Input>) -> Self {
         let (pin, config) = client_config(pin);
-        Self { address, pin, config, inputs, endpoints: [None, None] }
+        let (endpoints, failures) = (Endpoints::default(), Arc::default());
+        Self { address, pin, config, inputs, endpoints, failures }
     }
 
     /// The sentence for people, if the server showed another certificate than the pinned one.
@@ -85,35 +89,79 @@ impl Dialer {
     }
 
     /// Starts a connection; what comes of it arrives as inputs of this epoch.
-    pub fn dial(&mut self, epoch: u64) {
-        let connecting = self.begin();
+    pub fn dial(&self, epoch: u64) {
+        let name = self.address.clone();
+        self.dial_any(epoch, async move {
+            let found = tokio::net::lookup_host(&name).await;
+            let found: Vec<SocketAddr> = found
+                .map_err(|e| format!("\"{name}\" is no address ({e}); write host:port"))?
+                .collect();
+            if found.is_empty() {
+                Err(format!("\"{name}\" leads to no address"))
+            } else {
+                Ok(found)
+            }
+        });
+    }
+
+    /// Dials one of the addresses that are found: after each failure the next.
+    fn dial_any(
+        &self,
+        epoch: u64,
+        addresses: impl Future<Output = Result<Vec<SocketAddr>, String>> + Send + 'static,
+    ) {
         let inputs = Inputs { epoch, sender: self.inputs.clone() };
+        let (config, endpoints) = (self.config.clone(), self.endpoints.clone());
+        let failures = Arc::clone(&self.failures);
         tokio::spawn(async move {
-            match connecting {
-                Ok(connecting) => converse(connecting, inputs).await,
-                Err(why) => inputs.send(Happened::Lost { close: None, why }).await,
+            let connected = async {
+                let (config, addresses) =
+                    (config.map_err(lost_for)?, addresses.await.map_err(lost_for)?);
+                let turn = failures.load(Ordering::Relaxed) % addresses.len();
+                let connecting = endpoints.connect(config, addresses[turn]).map_err(lost_for)?;
+                // Where there is another way, nobody waits long for one that leads nowhere.
+                let limit = if addresses.len() > 1 { ATTEMPT } else { Duration::MAX };
+                let connected = tokio::time::timeout(limit, connecting).await;
+                let silent = |_| lost_for(format!("{} does not answer", addresses[turn]));
+                let connection = connected.map_err(silent)?.map_err(|error| lost(&error))?;
+                let control = connection.open_bi().await.map_err(|error| lost(&error))?;
+                Ok((connection, control))
+            };
+            match connected.await {
+                Ok((connection, control)) => converse(connection, control, inputs).await,
+                Err(lost) => {
+                    failures.fetch_add(1, Ordering::Relaxed);
+                    inputs.send(lost).await;
+                }
             }
         });
     }
 
     /// Lets the last packets out.
     pub async fn end(self, within: Duration) {
-        for endpoint in self.endpoints.into_iter().flatten() {
+        let endpoints = std::mem::take(&mut *self.endpoints.lock());
+        for endpoint in endpoints.into_iter().flatten() {
             let _ = tokio::time::timeout(within, endpoint.wait_idle()).await;
         }
     }
+}
 
-    fn begin(&mut self) -> Result<quinn::Connecting, String> {
-        let config = self.config.clone()?;
-        let mut found = std::net::ToSocketAddrs::to_socket_addrs(&self.address)
-            .map_err(|e| format!("\"{}\" is no address ({e}); write host:port", self.address))?;
-        let address =
-            found.next().ok_or_else(|| format!("\"{}\" leads to no address", self.address))?;
+/// One per address family, made when first needed.
+#[derive(Clone, Default)]
+struct Endpoints(Arc<Mutex<[Option<Endpoint>; 2]>>);
+
+impl Endpoints {
+    fn connect(
+        &self,
+        config: quinn::ClientConfig,
+        address: SocketAddr,
+    ) -> Result<quinn::Connecting, String> {
         let (slot, local) = match address {
             SocketAddr::V4(_) => (0, SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0))),
             SocketAddr::V6(_) => (1, SocketAddr::from((Ipv6Addr::UNSPECIFIED, 0))),
         };
-        let endpoint = match &mut self.endpoints[slot] {
+        let mut endpoints = self.lock();
+        let endpoint = match &mut endpoints[slot] {
             Some(endpoint) => endpoint,
             none => {
                 let made = Endpoint::client(local);
@@ -121,6 +169,11 @@ impl Dialer {
             }
         };
         endpoint.connect_with(config, address, SERVER_NAME).map_err(|e| e.to_string())
+    }
+
+    /// A panic elsewhere leaves whole endpoints behind.
+    fn lock(&self) -> std::sync::MutexGuard<'_, [Option<Endpoint>; 2]> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -218,26 +271,21 @@ impl Inputs {
     }
 }
 
-/// One connection from dialling to its end.
-async fn converse(connecting: quinn::Connecting, inputs: Inputs) {
-    let opened = async {
-        let connection = connecting.await?;
-        let control = connection.open_bi().await?;
-        Ok::<_, ConnectionError>((connection, control))
-    };
-    match opened.await {
-        Err(error) => inputs.send(lost(&error)).await,
-        Ok((connection, (send, receive))) => {
-            let (writer, messages) = mpsc::channel(1);
-            tokio::spawn(write_control(send, messages, inputs.clone()));
-            tokio::spawn(read_control(receive, inputs.clone()));
-            tokio::spawn(accept_chunks(connection.clone(), inputs.clone()));
-            let link = Link { connection: connection.clone(), writer };
-            inputs.send(Happened::Connected(link)).await;
-            let error = connection.closed().await;
-            inputs.send(lost(&error)).await;
-        }
-    }
+/// One connection to its end.
+async fn converse(connection: Connection, control: (SendStream, RecvStream), inputs: Inputs) {
+    let (writer, messages) = mpsc::channel(1);
+    let (send, receive) = control;
+    tokio::spawn(write_control(send, messages, inputs.clone()));
+    tokio::spawn(read_control(receive, inputs.clone()));
+    tokio::spawn(accept_chunks(connection.clone(), inputs.clone()));
+    let link = Link { connection: connection.clone(), writer };
+    inputs.send(Happened::Connected(link)).await;
+    let error = connection.closed().await;
+    inputs.send(lost(&error)).await;
+}
+
+fn lost_for(why: String) -> Happened {
+    Happened::Lost { close: None, why }
 }
 
 fn lost(error: &ConnectionError) -> Happened {
@@ -293,5 +341,30 @@ async fn read_chunk(mut stream: RecvStream, inputs: Inputs) {
             }
             Err(_) => return inputs.send(Happened::ChunkReset { stream: id }).await,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_name_with_several_addresses_is_tried_at_each_in_turn() {
+        let (sender, mut inputs) = mpsc::channel(8);
+        let dialer = Dialer::new("unused:1".into(), None, sender);
+        // Ports of ours at which nobody ever answers.
+        let bind = || std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        let (one, two) = (bind(), bind());
+        let addresses = [&one, &two].map(|socket| socket.local_addr().unwrap());
+        let mut tried = Vec::new();
+        for epoch in 0..3 {
+            dialer.dial_any(epoch, std::future::ready(Ok(addresses.to_vec())));
+            let Some(Input { what: Happened::Lost { why, .. }, .. }) = inputs.recv().await else {
+                panic!("nobody is there")
+            };
+            let named = addresses.iter().position(|address| why.contains(&address.to_string()));
+            tried.push(named.expect("the address is named"));
+        }
+        assert_eq!(tried, [0, 1, 0]);
     }
 }

@@ -2,6 +2,7 @@
 //! loaders, and ends with the handle.
 
 mod link;
+mod missing;
 mod tls;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -12,7 +13,7 @@ use std::time::{Duration, Instant};
 use protocol::manifest::ChunkRef;
 use protocol::message::{Priority, TagOutcome, Telemetry};
 use protocol::session::{self, ClientEvent, Time};
-use protocol::{ChunkHash, GarmentId, SignedManifest};
+use protocol::{ChunkHash, GarmentId, SignedManifest, VersionNumber};
 use tokio::sync::mpsc;
 
 use crate::client::{ClientConfig, Shared};
@@ -21,6 +22,7 @@ use crate::shared::Stage;
 
 pub use link::quic_config;
 use link::{Dialer, Happened, Input, Link};
+use missing::Missing;
 pub use tls::Fingerprint;
 
 /// How often cursors are looked at: well within a frame at 30 fps.
@@ -36,7 +38,11 @@ const INPUTS_MAX: usize = 256;
 pub(crate) fn run(config: ClientConfig, pin: Option<Fingerprint>, shared: &Arc<Shared>) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     match runtime {
-        Ok(runtime) => runtime.block_on(Driver::new(config, pin, Arc::clone(shared)).run()),
+        Ok(runtime) => {
+            runtime.block_on(Driver::new(config, pin, Arc::clone(shared)).run());
+            // A name that is being looked up must not hold the end.
+            runtime.shutdown_background();
+        }
         Err(error) => shared.update(|status| {
             status.error = Some(format!("the network thread could not be started: {error}"));
             status.is_final = true;
@@ -56,6 +62,9 @@ struct Driver {
     epoch: u64,
     loaders: BTreeMap<GarmentId, GarmentLoader>,
     wanted: BTreeMap<ChunkHash, (ChunkRef, Need)>,
+    missing: Missing,
+    /// The version that all play, as it was told.
+    shown: Option<VersionNumber>,
     versions_applied: u64,
     bytes_before: u64,
     reported: Instant,
@@ -88,6 +97,8 @@ impl Driver {
             epoch: 0,
             loaders: BTreeMap::new(),
             wanted: BTreeMap::new(),
+            missing: Missing::default(),
+            shown: None,
             versions_applied: 0,
             bytes_before: 0,
             reported: Instant::now(),
@@ -145,6 +156,7 @@ impl Driver {
     fn work(&mut self) {
         let asked = self.shared.asked.load(Ordering::SeqCst);
         self.show_views();
+        self.retry_missing();
         let due = self.planned.is_none_or(|at| at.elapsed() >= TICK);
         if due || asked > self.answered {
             self.planned = Some(Instant::now());
@@ -217,7 +229,8 @@ impl Driver {
                 }
                 ClientEvent::Missing { hash } => {
                     self.wanted.remove(&hash);
-                    self.note(format!("the server does not have chunk {hash}"));
+                    self.note(not_there(&hash));
+                    self.missing.note(hash, Instant::now());
                     self.loaders.values_mut().for_each(|loader| loader.handle_missing(hash));
                 }
                 ClientEvent::Disconnect { reason } => self.disconnect(&reason),
@@ -245,6 +258,7 @@ impl Driver {
 
     fn take_version(&mut self, signed: &SignedManifest) {
         self.planned = None;
+        self.missing.clear();
         let manifest = &signed.manifest;
         let chosen = &self.config.garments;
         let played = |name: &String| chosen.is_empty() || chosen.contains(name);
@@ -261,6 +275,12 @@ impl Driver {
 
     fn take_chunk(&mut self, hash: ChunkHash, bytes: &[u8]) {
         self.wanted.remove(&hash);
+        if self.missing.forget(&hash) {
+            let mended = Some(not_there(&hash));
+            self.shared.update(|status| {
+                status.error.take_if(|error| Some(&*error) == mended.as_ref());
+            });
+        }
         let mut refused: Option<LoadError> = None;
         for loader in self.loaders.values_mut() {
             refused = loader.handle_chunk(hash, bytes).err().or(refused);
@@ -294,12 +314,16 @@ impl Driver {
         if let Some(error) = refused {
             self.note(error);
         }
-        if !any_new {
+        // A garment that this client cannot play keeps nobody from playing the others.
+        let playable = self.loaders.values().filter(|loader| !loader.is_stuck());
+        let shown = playable.map(|l| l.current().map(|version| version.number())).min().flatten();
+        if any_new {
+            self.planned = None;
+        } else if shown <= self.shown {
             return;
         }
-        self.planned = None;
-        let shown = self.loaders.values().map(|l| l.current().map(|version| version.number()));
-        if let Some(Some(number)) = shown.min() {
+        if let Some(number) = shown {
+            self.shown = shown;
             self.session.applied(number);
             self.versions_applied += 1;
             let applied = self.versions_applied;
@@ -307,6 +331,14 @@ impl Driver {
                 status.version = Some(number);
                 status.versions_applied = applied;
             });
+        }
+    }
+
+    /// Asks again for what the server did not have a while ago.
+    fn retry_missing(&mut self) {
+        for chunk in self.missing.due(Instant::now()) {
+            self.planned = None;
+            self.loaders.values_mut().for_each(|loader| loader.retry_missing(chunk));
         }
     }
 
@@ -337,6 +369,10 @@ impl Driver {
 
     fn report(&mut self) {
         self.reported = Instant::now();
+        // While the line is down counts stay where they are: there they are added up.
+        if !self.session.is_open() {
+            return;
+        }
         for (id, loader) in &mut self.loaders {
             let batch = loader.stage().mailbox().drain();
             let Some(version) = loader.current().map(|version| version.number()) else { continue };
@@ -411,6 +447,10 @@ impl Driver {
             status.is_final = true;
         });
     }
+}
+
+fn not_there(chunk: &ChunkHash) -> String {
+    format!("the server does not have chunk {chunk}")
 }
 
 fn micros(at: Time) -> Duration {

@@ -24,6 +24,7 @@ const SOON: Duration = Duration::from_secs(10);
 struct World {
     chunks: BTreeMap<ChunkHash, Vec<u8>>,
     walked: u64,
+    reports: u64,
     applied: Vec<VersionNumber>,
 }
 
@@ -149,7 +150,9 @@ async fn serve(
                 ServerEvent::Applied(version) => world.lock().unwrap().applied.push(version),
                 ServerEvent::Telemetry { telemetry, .. } => {
                     let walked: u32 = telemetry.edges.iter().map(|(_, count)| count).sum();
-                    world.lock().unwrap().walked += u64::from(walked);
+                    let mut world = world.lock().unwrap();
+                    world.walked += u64::from(walked);
+                    world.reports += 1;
                 }
                 ServerEvent::Closed { code, message } => {
                     while let Some(bytes) = session.poll_transmit() {
@@ -280,4 +283,69 @@ fn nobody_there_is_an_error_that_says_so_and_the_end_comes_quickly() {
     let client = Client::connect(ClientConfig::new("nowhere")).unwrap();
     let error = client.wait_ready(Duration::from_millis(200)).unwrap_err().to_string();
     assert!(error.contains("host:port"), "{error}");
+}
+
+#[test]
+fn a_chunk_that_the_server_gets_later_is_asked_for_again() {
+    let server = TestServer::start(None);
+    let (garment, _) = tiny::published(tiny::initial_links());
+    server.publish(1, tiny::initial_links());
+    let late = garment.scene.hash;
+    let bytes = server.world.lock().unwrap().chunks.remove(&late).unwrap();
+    let client = server.client(|_| {});
+    let error = client.wait_ready(Duration::from_millis(500)).unwrap_err().to_string();
+    assert!(error.contains(&late.to_string()), "{error}");
+    server.world.lock().unwrap().chunks.insert(late, bytes);
+    client.wait_ready(Duration::MAX).unwrap();
+    assert_eq!(client.status().error, None, "it is mended");
+}
+
+#[test]
+fn a_garment_that_cannot_be_read_keeps_nobody_from_the_others() {
+    let server = TestServer::start(None);
+    let (garment, chunks) = tiny::published(tiny::initial_links());
+    let mut other = garment.clone();
+    (other.id, other.name) = (GarmentId(1), "cloak".into());
+    other.codec = "h.266".into();
+    server.world.lock().unwrap().chunks.extend(chunks);
+    let manifest =
+        Manifest { number: VersionNumber(1), previous: None, garments: vec![garment, other] };
+    server.head.send_replace(Some(Arc::new(manifest.sign(&SigningKey::from_seed(&[7; 32])))));
+    let client = server.client(|_| {});
+    client.wait_ready(SOON).unwrap();
+    let status = client.status();
+    assert_eq!(status.version, Some(VersionNumber(1)));
+    assert!(status.error.is_some_and(|error| error.contains("h.266")));
+    assert_eq!(client.garments(), ["speck"]);
+}
+
+#[test]
+fn what_is_walked_while_the_line_is_down_is_added_up_and_told_once() {
+    let identity = Identity::make();
+    let server = TestServer::start_at(([127, 0, 0, 1], 0).into(), &identity, None);
+    server.publish(1, tiny::initial_links());
+    let address = server.address;
+    let client = server.client(|_| {});
+    client.wait_ready(SOON).unwrap();
+    let mut character = client.character(None).unwrap();
+    server.stop();
+    let deadline = Instant::now() + SOON;
+    while client.status().connected && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    // Longer than counts take to be reported, twice.
+    for frame in 0..50u32 {
+        character.step(PoseId((frame + 1) % 2));
+        std::thread::sleep(REPORT / 20);
+    }
+    let again = TestServer::start_at(address, &identity, None);
+    again.publish(1, tiny::initial_links());
+    let deadline = Instant::now() + SOON;
+    while again.world.lock().unwrap().walked < 50 && Instant::now() < deadline {
+        character.step(PoseId(0));
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let world = again.world.lock().unwrap();
+    assert!(world.walked >= 50, "{} of 50", world.walked);
+    assert_eq!(world.reports, 1, "in one report");
 }

@@ -118,6 +118,10 @@ fn what_is_broken_or_missing_is_named_and_not_asked_for_again() {
     loader.handle_missing(garment.scene.hash);
     let wanted = wants(&mut loader);
     assert!(!wanted.contains_key(&region) && !wanted.contains_key(&garment.scene.hash));
+    assert!(loader.is_stuck(), "a broken part does not mend itself");
+    // What the server did not have it may have a while later.
+    loader.retry_missing(garment.scene.hash);
+    assert!(wants(&mut loader).contains_key(&garment.scene.hash));
     // The next version asks again.
     loader.handle_version(VersionNumber(2), &garment).unwrap();
     assert!(wants(&mut loader).contains_key(&region));
@@ -126,6 +130,52 @@ fn what_is_broken_or_missing_is_named_and_not_asked_for_again() {
     other.codec = "h.266".into();
     let error = loader.handle_version(VersionNumber(3), &other).unwrap_err();
     assert!(error.to_string().contains("h.266"), "{error}");
+    assert!(!loader.is_stuck(), "the version before is played on");
+    let mut unreadable = self::loader();
+    assert!(unreadable.handle_version(VersionNumber(3), &other).is_err() && unreadable.is_stuck());
+}
+
+/// How often chunks were fetched until nothing more was wanted, and how often the same.
+fn fetches(budget_bytes: usize, links: Vec<protocol::links::LinkEntry>) -> (usize, usize, usize) {
+    let (garment, chunks) = tiny::published_in_parts(links);
+    let mut loader = GarmentLoader::new(Arc::default(), budget_bytes, Horizon::default());
+    loader.handle_version(VersionNumber(1), &garment).unwrap();
+    feed(&mut loader, &chunks, Need::Version).unwrap();
+    let mut characters: Vec<_> =
+        (0..3).map(|_| Character::enter(loader.stage()).unwrap()).collect();
+    let mut counts: BTreeMap<ChunkHash, usize> = BTreeMap::new();
+    for round in 0..50 {
+        let wanted = wants(&mut loader);
+        for hash in wanted.keys() {
+            *counts.entry(*hash).or_default() += 1;
+            loader.handle_chunk(*hash, &chunks[hash]).unwrap();
+        }
+        loader.show().unwrap();
+        if round == 10 {
+            // Characters, which have nothing to do with it, play.
+            for character in &mut characters {
+                character.step(PoseId(1));
+            }
+        }
+    }
+    let memory = loader.memory();
+    let most = counts.values().copied().max().unwrap_or(0);
+    (counts.len(), most, memory.regions - memory.initial)
+}
+
+#[test]
+fn what_does_not_fit_decoded_is_not_fetched_again_and_again() {
+    // Encoded, the streamed chunk would fit into this many bytes.
+    let (garment, _) = tiny::published_in_parts(tiny::grown_links());
+    let region = &garment.regions[1];
+    let expected = decoded_bytes(&garment, region);
+    let small = 2 * region.chunk.bytes as usize;
+    assert!(small < expected, "{small} bytes, {expected} decoded");
+    let (_, most, held) = fetches(small, tiny::grown_links());
+    assert!(most <= 2, "fetched {most} times");
+    assert!(held <= small);
+    let (_, most, held) = fetches(2 * expected, tiny::grown_links());
+    assert_eq!((most, held > 0), (1, true));
 }
 
 #[test]

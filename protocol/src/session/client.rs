@@ -108,12 +108,20 @@ enum Link {
     Closed,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Incoming {
     /// Head, then the chunk.
     bytes: Vec<u8>,
+    /// What it brings, once its head is here and as long as somebody waits for it.
+    hash: Option<ChunkHash>,
     /// Nobody waits for it any more.
     discard: bool,
+}
+
+impl Incoming {
+    fn discarded() -> Self {
+        Self { discard: true, ..Self::default() }
+    }
 }
 
 impl Client {
@@ -183,7 +191,8 @@ impl Client {
 
     /// Bytes from one of the server's unidirectional streams.
     ///
-    /// * `stream`: any number that tells the connection's streams apart.
+    /// * `stream`: its number, in the order in which the server opened the connection's streams. Of two
+    ///   that bring the same chunk, the later one counts: the other was cancelled.
     /// * `end`: no more bytes will follow.
     pub fn handle_chunk(&mut self, now: Time, stream: u64, bytes: &[u8], end: bool) {
         if !self.is_talking() {
@@ -196,10 +205,8 @@ impl Client {
 
     /// The server has cut this stream; its chunk is asked for again if it is still wanted.
     pub fn handle_chunk_reset(&mut self, stream: u64) {
-        let Some(incoming) = self.incoming.remove(&stream) else { return };
-        if let Some(head) = incoming.bytes.first_chunk::<CHUNK_HEAD_BYTES>() {
-            self.wants.ask_again(&parse_chunk_head(head).0);
-        }
+        let hash = self.incoming.remove(&stream).and_then(|incoming| incoming.hash);
+        hash.iter().for_each(|hash| self.wants.ask_again(hash));
     }
 
     /// Time has passed.
@@ -406,12 +413,14 @@ impl Client {
             ServerMessage::ManifestDifference(_) if self.config.pin.is_some() => Ok(()),
             ServerMessage::ManifestDifference(bytes) => {
                 let publisher = self.known_publisher()?;
-                let difference = ManifestDifference::decode(&bytes)?;
                 let base = self.manifest.as_ref().filter(|_| !self.whole);
                 let base = base.ok_or(SessionError::OutOfPlace("a difference to nothing"))?;
-                let applied = difference.apply(&base.manifest, &publisher);
-                self.whole = applied.is_err();
-                self.accept(applied?)
+                // Whatever is wrong with it, the same one must not come again.
+                self.whole = true;
+                let difference = ManifestDifference::decode(&bytes)?;
+                let applied = difference.apply(&base.manifest, &publisher)?;
+                self.whole = false;
+                self.accept(applied)
             }
             ServerMessage::Missing { hash } => {
                 if self.wants.forget(&hash) {
@@ -466,41 +475,63 @@ impl Client {
     }
 
     fn receive(&mut self, stream: u64, bytes: &[u8], end: bool) -> Result<(), SessionError> {
-        let known = self.incoming.contains_key(&stream);
-        if !known && self.incoming.len() >= limits::FETCHES_MAX {
+        let known = self.incoming.remove(&stream);
+        if known.is_none() && self.incoming.len() >= limits::FETCHES_MAX {
             return Err(SessionError::OutOfPlace("more chunk streams than fetches"));
         }
-        let blank = || Incoming { bytes: Vec::new(), discard: false };
-        let incoming = self.incoming.entry(stream).or_insert_with(blank);
+        let mut incoming = known.unwrap_or_default();
         if !incoming.discard {
-            // A stream that nobody asked for is refused as soon as its head is there.
-            let head_lacks = CHUNK_HEAD_BYTES.saturating_sub(incoming.bytes.len());
-            let (head, body) = bytes.split_at(head_lacks.min(bytes.len()));
-            incoming.bytes.extend_from_slice(head);
-            if let Some(head) = incoming.bytes.first_chunk::<CHUNK_HEAD_BYTES>() {
-                let (hash, length) = parse_chunk_head(head);
-                let damaged = |why| SessionError::DamagedChunk { hash, why };
-                match self.wants.asked_bytes_of(&hash) {
-                    None => *incoming = Incoming { bytes: Vec::new(), discard: true },
-                    Some(expected) if expected != length => {
-                        return Err(damaged("its length is not the manifest's"));
-                    }
-                    Some(expected) => {
-                        incoming.bytes.extend_from_slice(body);
-                        if incoming.bytes.len() > CHUNK_HEAD_BYTES + expected as usize {
-                            return Err(damaged("it goes on after its end"));
-                        }
-                    }
-                }
-            }
+            self.collect(stream, &mut incoming, bytes)?;
         }
-        if end { self.finish(stream) } else { Ok(()) }
+        if end {
+            return self.finish(incoming);
+        }
+        self.incoming.insert(stream, incoming);
+        Ok(())
     }
 
-    fn finish(&mut self, stream: u64) -> Result<(), SessionError> {
-        let Some(mut incoming) = self.incoming.remove(&stream).filter(|i| !i.discard) else {
+    /// Adds to a chunk. A stream that nobody asked for is refused as soon as its head is there.
+    fn collect(
+        &mut self,
+        stream: u64,
+        incoming: &mut Incoming,
+        bytes: &[u8],
+    ) -> Result<(), SessionError> {
+        let head_lacks = CHUNK_HEAD_BYTES.saturating_sub(incoming.bytes.len());
+        let (head, body) = bytes.split_at(head_lacks.min(bytes.len()));
+        incoming.bytes.extend_from_slice(head);
+        let Some(head) = incoming.bytes.first_chunk::<CHUNK_HEAD_BYTES>() else { return Ok(()) };
+        let (hash, length) = parse_chunk_head(head);
+        let damaged = |why| Err(SessionError::DamagedChunk { hash, why });
+        let Some(expected) = self.wants.asked_bytes_of(&hash) else {
+            *incoming = Incoming::discarded();
             return Ok(());
         };
+        if expected != length {
+            return damaged("its length is not the manifest's");
+        }
+        if incoming.hash.replace(hash).is_none() {
+            // One stream alone collects a chunk, or a server could fill our memory with one hash.
+            match self.incoming.iter_mut().find(|(_, other)| other.hash == Some(hash)) {
+                Some((later, _)) if *later > stream => {
+                    *incoming = Incoming::discarded();
+                    return Ok(());
+                }
+                Some((_, earlier)) => *earlier = Incoming::discarded(),
+                None => {}
+            }
+        }
+        incoming.bytes.extend_from_slice(body);
+        if incoming.bytes.len() > CHUNK_HEAD_BYTES + expected as usize {
+            return damaged("it goes on after its end");
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self, mut incoming: Incoming) -> Result<(), SessionError> {
+        if incoming.discard {
+            return Ok(());
+        }
         let head = incoming.bytes.first_chunk::<CHUNK_HEAD_BYTES>();
         let head = head.ok_or(SessionError::OutOfPlace("a chunk stream without a head"))?;
         let (hash, length) = parse_chunk_head(head);

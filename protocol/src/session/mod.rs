@@ -12,11 +12,13 @@
 //! `now` never goes backwards. All queues are bounded by [`limits`](crate::limits).
 
 mod client;
+mod deliveries;
 mod error;
 mod server;
 mod wants;
 
 pub use client::{Client, ClientConfig, ClientEvent};
+pub use deliveries::Deliveries;
 pub use error::SessionError;
 pub use server::{Server, ServerConfig, ServerEvent};
 

@@ -3,8 +3,7 @@
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
-use super::{Allowance, Time};
-use crate::difference::ManifestDifference;
+use super::{Allowance, Deliveries, Time};
 use crate::frame::{FrameDecoder, frame};
 use crate::ids::{ChunkHash, GarmentId, StateId, VersionNumber};
 use crate::limits;
@@ -52,7 +51,7 @@ pub enum ServerEvent {
     Applied(VersionNumber),
     /// What the client saw, with its weight capped.
     Telemetry {
-        /// The report; `edges` holds no more traversals than one client may add.
+        /// The report; it holds no more traversals, and no more outcomes, than one client may add.
         telemetry: Telemetry,
         /// Traversals above the cap, dropped.
         dropped: u64,
@@ -97,10 +96,18 @@ pub struct Server {
     fetches: BTreeSet<ChunkHash>,
     messages: Allowance,
     traversals: Allowance,
+    /// Outcomes of steps, jumps among them.
+    steps: Allowance,
+    /// Substituted steps of the last report of which nobody has said that they were outside.
+    substituted: u32,
     may_tag: bool,
     tags: Allowance,
     /// No other version than this is sent.
     pinned: Option<VersionNumber>,
+    /// The host looks for it.
+    looking_up: Option<VersionNumber>,
+    pins: Allowance,
+    deliveries: Arc<Deliveries>,
     outbox: VecDeque<ServerMessage>,
     events: VecDeque<ServerEvent>,
 }
@@ -139,12 +146,22 @@ impl Server {
             fetches: BTreeSet::new(),
             messages: Allowance::new(messages, messages),
             traversals: Allowance::new(traversals, limits::TRAVERSALS_BURST_MAX),
+            steps: Allowance::new(traversals, limits::TRAVERSALS_BURST_MAX),
+            substituted: 0,
             may_tag: false,
             tags: Allowance::new(limits::TAGS_PER_SECOND_MAX, limits::TAGS_BURST_MAX),
             pinned: None,
+            looking_up: None,
+            pins: Allowance::new(limits::PINS_PER_SECOND_MAX, limits::PINS_BURST_MAX),
+            deliveries: Arc::default(),
             outbox: VecDeque::new(),
             events: VecDeque::new(),
         }
+    }
+
+    /// Shares what is made for one player with the sessions of all others.
+    pub fn sharing(self, deliveries: Arc<Deliveries>) -> Self {
+        Self { deliveries, ..self }
     }
 
     /// Bytes from the control stream.
@@ -195,15 +212,19 @@ impl Server {
             return;
         }
         let have_hash = self.have.map(|have| have.hash);
-        let held = manifest.filter(|held| Some(held.manifest.hash()) == have_hash);
+        let held = manifest.filter(|held| Some(self.deliveries.hash(held)) == have_hash);
         self.base = held.map_or(Base::Nothing, Base::Held);
     }
 
     /// The version that [`ServerEvent::Pin`] asked for; `None` where the store has none, which ends the
     /// conversation.
     pub fn handle_pinned(&mut self, number: VersionNumber, manifest: Option<Arc<SignedManifest>>) {
-        if self.pinned != Some(number) {
+        if self.looking_up != Some(number) {
             return;
+        }
+        self.looking_up = None;
+        if self.pinned != Some(number) {
+            return self.look_up_pinned();
         }
         match manifest {
             Some(manifest) => self.head = Some(manifest),
@@ -256,9 +277,11 @@ impl Server {
 
     /// Bytes for the control stream. A new head waits here until the stream has taken the one
     /// before, so that a slow client skips versions rather than queueing them.
-    pub fn poll_transmit(&mut self) -> Option<Vec<u8>> {
-        let message = self.outbox.pop_front().or_else(|| self.next_version())?;
-        Some(frame(&message.encode()))
+    pub fn poll_transmit(&mut self) -> Option<Arc<[u8]>> {
+        match self.outbox.pop_front() {
+            Some(message) => Some(frame(&message.encode()).into()),
+            None => self.next_version(),
+        }
     }
 
     /// What to do next.
@@ -305,15 +328,11 @@ impl Server {
             }
             (ClientMessage::Telemetry(telemetry), _) => self.weigh(now, telemetry),
             (ClientMessage::Bye, _) => self.close(CloseCode::Done, "bye"),
-            (ClientMessage::Pin { version }, _) => {
-                self.pinned = Some(version);
-                self.head = None;
-                self.have = None;
-                self.base = Base::Nothing;
-                self.events.push_back(ServerEvent::Pin(version));
-            }
+            (ClientMessage::Pin { version }, _) => self.pin(now, version),
             (ClientMessage::Tag { garment, state }, _) => self.tag(now, garment, state),
             (ClientMessage::Outside { steps, .. }, _) => {
+                let steps = steps.min(self.substituted);
+                self.substituted -= steps;
                 self.events.push_back(ServerEvent::Outside { steps });
             }
         }
@@ -343,6 +362,29 @@ impl Server {
         self.config.token.is_none() || is_shown(self.config.token.as_deref(), token)
     }
 
+    fn pin(&mut self, now: Time, version: VersionNumber) {
+        if self.pins.take(now, 1) == 0 {
+            let max = limits::PINS_PER_SECOND_MAX;
+            let why = format!("more than {max} pins a second");
+            return self.close(CloseCode::TooManyMessages, &why);
+        }
+        if self.pinned != Some(version) {
+            self.pinned = Some(version);
+            self.head = None;
+            self.have = None;
+            self.base = Base::Nothing;
+            self.look_up_pinned();
+        }
+    }
+
+    /// One look at a time: of what is asked for meanwhile, the newest is looked up after it.
+    fn look_up_pinned(&mut self) {
+        if let (None, Some(version)) = (self.looking_up, self.pinned) {
+            self.looking_up = Some(version);
+            self.events.push_back(ServerEvent::Pin(version));
+        }
+    }
+
     fn tag(&mut self, now: Time, garment: GarmentId, state: StateId) {
         if !self.may_tag {
             self.handle_tagged(garment, state, TagOutcome::NotAllowed);
@@ -366,29 +408,35 @@ impl Server {
             *count = kept;
         }
         telemetry.edges.retain(|(_, count)| *count > 0);
+        let Telemetry { exact, substituted, missed, jumps, .. } = &mut telemetry;
+        let outcomes = [exact, substituted, missed, jumps];
+        let told = outcomes.iter().map(|count| u64::from(**count)).sum::<u64>();
+        let kept = self.steps.take(now, u32::try_from(told).unwrap_or(u32::MAX));
+        for count in outcomes {
+            // All alike, so that their shares stay as told. At most the count itself.
+            *count = (u64::from(*count) * u64::from(kept) / told.max(1)) as u32;
+        }
+        self.substituted = telemetry.substituted;
         self.events.push_back(ServerEvent::Telemetry { telemetry, dropped });
     }
 
     /// The head, if the client should have it: as a difference where that can be, else whole.
-    fn next_version(&mut self) -> Option<ServerMessage> {
+    fn next_version(&mut self) -> Option<Arc<[u8]>> {
         if self.link != Link::Open || self.publisher.is_none() {
             return None;
         }
         let head = self.head.as_ref()?;
         let number = head.manifest.number;
-        let message = match &self.base {
+        let bytes = match &self.base {
             Base::Asked => return None,
             Base::Held(held) if held.manifest.number >= number => return None,
-            Base::Held(held) => {
-                let difference = ManifestDifference::compute(&held.manifest, head).encode();
-                ServerMessage::ManifestDifference(difference)
-            }
+            Base::Held(held) => self.deliveries.difference(held, head),
             // A client may hold a version that this server's store does not show yet.
             Base::Nothing if self.have.is_some_and(|have| have.version >= number) => return None,
-            Base::Nothing => ServerMessage::ManifestFull(head.encode()),
+            Base::Nothing => self.deliveries.full(head),
         };
         self.base = Base::Held(head.clone());
-        Some(message)
+        Some(bytes)
     }
 }
 

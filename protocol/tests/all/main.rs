@@ -2,6 +2,7 @@
 
 mod formats;
 mod link;
+mod rudeness;
 mod samples;
 mod sessions;
 mod versions;

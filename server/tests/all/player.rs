@@ -177,6 +177,13 @@ async fn dial(endpoint: &Endpoint, server: SocketAddr) -> Result<Line, quinn::Co
 
 /// A client's end that accepts only the certificate with this fingerprint.
 pub fn endpoint(fingerprint: &str, alpn: &[u8]) -> Endpoint {
+    let mut endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
+    endpoint.set_default_client_config(config(fingerprint, alpn));
+    endpoint
+}
+
+/// How it speaks.
+pub fn config(fingerprint: &str, alpn: &[u8]) -> quinn::ClientConfig {
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let pinned = Arc::new(Pinned { fingerprint: fingerprint.into(), provider: provider.clone() });
     let mut tls = rustls::ClientConfig::builder_with_provider(provider)
@@ -186,10 +193,7 @@ pub fn endpoint(fingerprint: &str, alpn: &[u8]) -> Endpoint {
         .with_custom_certificate_verifier(pinned)
         .with_no_client_auth();
     tls.alpn_protocols = vec![alpn.to_vec()];
-    let mut endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
-    let config = QuicClientConfig::try_from(tls).unwrap();
-    endpoint.set_default_client_config(quinn::ClientConfig::new(Arc::new(config)));
-    endpoint
+    quinn::ClientConfig::new(Arc::new(QuicClientConfig::try_from(tls).unwrap()))
 }
 
 #[derive(Debug)]

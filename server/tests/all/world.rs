@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use object_store::ObjectStore;
 use object_store::local::LocalFileSystem;
 use protocol::manifest::{ChunkRef, GarmentVersion, GenerationRef, RegionChunkRef, VersionStats};
 use protocol::{ChunkHash, GarmentId, Manifest, SigningKey, StateId, VersionNumber, store};
@@ -28,15 +29,23 @@ impl World {
     }
 
     pub fn config(&self) -> ServerConfig {
+        self.config_with(Arc::new(self.store()))
+    }
+
+    pub fn store(&self) -> LocalFileSystem {
         std::fs::create_dir_all(self.folder.path().join("store")).unwrap();
-        let store = LocalFileSystem::new_with_prefix(self.folder.path().join("store")).unwrap();
+        LocalFileSystem::new_with_prefix(self.folder.path().join("store")).unwrap()
+    }
+
+    /// The same world, by way of another store.
+    pub fn config_with(&self, store: Arc<dyn ObjectStore>) -> ServerConfig {
         let any = "127.0.0.1:0".parse().unwrap();
         ServerConfig {
             http: Some(any),
             token: Some("letmein".into()),
             poll_interval: Duration::from_millis(20),
             telemetry_interval: Duration::from_millis(50),
-            ..ServerConfig::new(Arc::new(store), any, self.folder.path().join("identity"))
+            ..ServerConfig::new(store, any, self.folder.path().join("identity"))
         }
     }
 
