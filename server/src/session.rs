@@ -25,8 +25,8 @@ const URGENT_SENDS_MAX: usize = 24;
 const READ_BYTES: usize = 16 << 10;
 /// How long the last words may take.
 const LAST_WORDS: Duration = Duration::from_millis(500);
-/// A store that fails is asked again after these pauses; then the session ends, and the client comes
-/// back.
+/// A store that fails is asked again after these pauses. If it fails altogether, the session then ends,
+/// and the client comes back.
 const STORE_PAUSES: [Duration; 4] = [
     Duration::from_millis(100),
     Duration::from_millis(200),
@@ -102,9 +102,9 @@ enum Done {
 enum Sent {
     /// It is on its way whole, or the connection or the wish for it is gone.
     Whole,
-    /// There is no such chunk, or only a damaged one.
+    /// There is no such chunk, or only one that cannot be read.
     Missing,
-    /// The store failed, again and again.
+    /// The store fails, again and again.
     Failed,
 }
 
@@ -367,7 +367,8 @@ async fn send(
 ) -> Sent {
     let bytes = match read(shared, hash).await {
         Ok(bytes) => bytes,
-        Err(ReadError::Store { .. }) => return Sent::Failed,
+        // This chunk alone cannot be read, or none can.
+        Err(ReadError::Store { .. }) if lock(&shared.failing).is_some() => return Sent::Failed,
         Err(_) => return Sent::Missing,
     };
     let Ok(stream) = connection.open_uni().await else { return Sent::Whole };

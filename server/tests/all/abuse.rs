@@ -52,13 +52,24 @@ async fn a_store_that_fails_for_a_moment_costs_a_moment() {
     assert_eq!(server.stats().store_failures, 2);
     server.shutdown().await;
 
-    // For longer: the session ends, the player comes back and asks again.
+    // One chunk that cannot be read keeps nobody from the others.
     let server = Server::start(world.config_with(store.clone())).await.unwrap();
-    store.fail(&path, 6);
+    store.fail(&path, u32::MAX);
     let player = play_all(&server).await;
-    assert_eq!((store.failures_left(), player.connections), (0, 2));
-    assert!(player.missing.is_empty() && player.chunks.contains_key(&victim));
-    let ended = player.ended.unwrap();
+    assert_eq!((player.missing.as_slice(), player.connections), (&[victim][..], 1));
+    server.shutdown().await;
+
+    // The whole store, for longer: the session ends, the player comes back and asks again.
+    store.fail(&path, 0);
+    let server = Server::start(world.config_with(store.clone())).await.unwrap();
+    until(&server, "version 1", |stats| stats.version == 1).await;
+    store.is_down.store(true, Ordering::Relaxed);
+    let mut player = Player::new(&server, Some("letmein"));
+    player.until("the end of the session", |player| player.ended.is_some()).await;
+    let ended = player.ended.take().unwrap();
+    store.is_down.store(false, Ordering::Relaxed);
+    player.until("all chunks", |p| p.chunks.len() == 5 + 4 && p.machine.wanted() == 0).await;
+    assert!(player.missing.is_empty() && player.connections >= 2);
     let internal = matches!(ended, SessionError::Closed { code: CloseCode::Internal, .. });
     assert!(internal && !ended.is_final(), "{ended}");
     assert_eq!(server.stats().broken_sessions, 0, "it was not the player's fault");
