@@ -60,7 +60,7 @@ pub enum Command {
 /// `toile up`.
 #[derive(Debug, Args)]
 pub struct Up {
-    /// Built-in scene (`robe`, `dress`) or a scene file.
+    /// A scene by name (robe, dress, dress-agile, robe-real, casual, coat, layers) or its file.
     #[arg(long, default_value = "robe")]
     pub scene: String,
     /// Object store: a folder or a URL [default: store/SCENE].
@@ -113,7 +113,7 @@ pub struct Up {
 /// `toile explore`.
 #[derive(Debug, Args)]
 pub struct Explore {
-    /// Built-in scene (`robe`, `dress`) or a scene file.
+    /// A scene by name (robe, dress, dress-agile, robe-real, casual, coat, layers) or its file.
     #[arg(long)]
     pub scene: String,
     /// Object store: a folder or a URL.
@@ -203,9 +203,9 @@ pub struct Serve {
 /// `toile play`.
 #[derive(Debug, Args)]
 pub struct Play {
-    /// The server's QUIC address.
-    #[arg(long)]
-    pub connect: SocketAddr,
+    /// The server's QUIC address, HOST:PORT.
+    #[arg(long, value_parser = address)]
+    pub connect: String,
     /// SHA-256 of the server's certificate, in hexadecimal.
     #[arg(long)]
     pub fingerprint: Option<String>,
@@ -248,9 +248,9 @@ pub struct View {
     /// A store to show: a folder or a URL. It is served on this machine.
     #[arg(value_name = "STORE", conflicts_with = "connect")]
     pub store: Option<String>,
-    /// The QUIC address of a server to show instead.
-    #[arg(long)]
-    pub connect: Option<SocketAddr>,
+    /// The QUIC address of a server to show instead, HOST:PORT.
+    #[arg(long, value_parser = address)]
+    pub connect: Option<String>,
     /// SHA-256 of the server's certificate, in hexadecimal.
     #[arg(long, requires = "connect")]
     pub fingerprint: Option<String>,
@@ -346,7 +346,7 @@ pub struct Inspect {
 /// `toile simulate`.
 #[derive(Debug, Args)]
 pub struct Simulate {
-    /// Built-in scene (`robe`, `dress`) or a scene file.
+    /// A scene by name (robe, dress, dress-agile, robe-real, casual, coat, layers) or its file.
     pub scene: String,
     /// random:SEED, clip:A,B,... or edges:FILE. A walk through clips starts at the first of them.
     #[arg(long, default_value = "random:1")]
@@ -546,6 +546,14 @@ fn duration(text: &str) -> Result<Duration, String> {
     };
     let value: f64 = digits.parse().map_err(|_| "expected a time such as 60s or 5m".to_string())?;
     Duration::try_from_secs_f64(value * seconds).map_err(|e| e.to_string())
+}
+
+fn address(text: &str) -> Result<String, String> {
+    let port = text.rsplit_once(':').filter(|(host, _)| !host.is_empty());
+    match port.map(|(_, port)| port.parse::<u16>()) {
+        Some(Ok(_)) => Ok(text.to_owned()),
+        _ => Err("write HOST:PORT, as in 127.0.0.1:4433".into()),
+    }
 }
 
 fn later_walk(text: &str) -> Result<(Duration, String), String> {

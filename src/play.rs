@@ -1,6 +1,5 @@
 //! `toile play`: a player without a window.
 
-use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail, ensure};
@@ -53,9 +52,9 @@ pub fn run(a: &args::Play) -> Result<()> {
     let client = Client::connect(ClientConfig {
         fingerprint: a.fingerprint.clone(),
         token: a.token.clone(),
-        ..ClientConfig::new(a.connect.to_string())
+        ..ClientConfig::new(a.connect.clone())
     })?;
-    wait_ready(&client, a.connect)?;
+    wait_ready(&client, &a.connect)?;
     let mut character = client.character(None)?;
     let scene = character.version().scene().clone();
     let mut walk = Walk::new(&spec, &scene, character.pose())?;
@@ -99,7 +98,7 @@ pub fn run(a: &args::Play) -> Result<()> {
 }
 
 /// Waits for the first version: long where a server is there, not where nobody answers.
-fn wait_ready(client: &Client, address: SocketAddr) -> Result<()> {
+fn wait_ready(client: &Client, address: &str) -> Result<()> {
     let start = Instant::now();
     let mut answered = false;
     loop {

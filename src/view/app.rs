@@ -12,7 +12,7 @@ use super::stand_in::Bare;
 use super::survey::{Loop, Survey};
 
 /// Pages at the same time.
-const PAGES_MAX: u64 = 16;
+pub const PAGES_MAX: u64 = 16;
 /// How long an older version may take to come.
 const OLDER_MAX: Duration = Duration::from_secs(20);
 /// How long a server may take to answer a tag.

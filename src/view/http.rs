@@ -66,10 +66,11 @@ fn content(kind: &'static str, body: &'static str) -> impl IntoResponse {
 }
 
 async fn live(State(app): State<Arc<App>>, upgrade: WebSocketUpgrade) -> Response {
-    let Some(place) = Place::take(&app) else {
-        return (StatusCode::SERVICE_UNAVAILABLE, "too many pages are open\n").into_response();
-    };
     let upgrade = upgrade.max_message_size(MESSAGE_BYTES_MAX).max_frame_size(MESSAGE_BYTES_MAX);
+    let Some(place) = Place::take(&app) else {
+        // A page cannot read why its socket is refused; so it is told over the socket.
+        return upgrade.on_upgrade(session::refuse);
+    };
     upgrade.write_buffer_size(0).on_upgrade(move |socket| async move {
         session::run(app, socket).await;
         drop(place);
@@ -81,7 +82,7 @@ async fn live(State(app): State<Arc<App>>, upgrade: WebSocketUpgrade) -> Respons
 /// steer.
 fn refusal(headers: &HeaderMap, address: Option<SocketAddr>) -> Option<&'static str> {
     let text = |value: &HeaderValue| value.to_str().unwrap_or("?").to_owned();
-    let host = headers.get(header::HOST).map(text)?;
+    let Some(host) = headers.get(header::HOST).map(text) else { return Some("name the host\n") };
     let port = address.map_or(0, |address| address.port());
     let own = ["127.0.0.1", "localhost", "[::1]"].map(|name| format!("{name}:{port}"));
     let listens = address.map(|address| address.to_string());
@@ -111,6 +112,7 @@ mod tests {
         let host = (header::HOST, "localhost:81");
         let socket = (header::UPGRADE, "websocket");
         assert_eq!(asked(std::slice::from_ref(&host)), None);
+        assert!(asked(&[(header::ORIGIN, "http://localhost:81")]).is_some(), "no host");
         assert_eq!(asked(&[host.clone(), (header::ORIGIN, "http://localhost:81")]), None);
         let own = (header::ORIGIN, "http://localhost:81");
         assert_eq!(asked(&[host.clone(), socket.clone(), own.clone()]), None);

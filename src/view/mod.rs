@@ -114,7 +114,7 @@ pub fn run(a: &args::View) -> Result<()> {
             let config = ClientConfig {
                 fingerprint: a.fingerprint.clone(),
                 token: a.token.clone(),
-                ..ClientConfig::new(address.to_string())
+                ..ClientConfig::new(address.clone())
             };
             (config, None)
         }

@@ -10,7 +10,7 @@ use axum::extract::ws::{Message, Utf8Bytes, WebSocket};
 use serde_json::json;
 use tokio::time::timeout;
 
-use super::app::App;
+use super::app::{App, PAGES_MAX};
 use super::show::{Command, Said, Show};
 
 /// A page that takes no answer for this long is given up.
@@ -53,6 +53,15 @@ pub async fn run(app: Arc<App>, mut socket: WebSocket) {
             }
         }
     }
+}
+
+/// Tells a page that there is no room for it, and closes its line.
+pub async fn refuse(mut socket: WebSocket) {
+    let why = format!("{PAGES_MAX} pages are open; close one");
+    let text = said(Said::Text(json!({ "say": "refused", "why": why })));
+    // A page that has gone already needs no word.
+    let _ = socket.send(text).await;
+    let _ = socket.send(Message::Close(None)).await;
 }
 
 /// What a message is answered with.

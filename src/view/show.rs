@@ -361,7 +361,10 @@ impl Show {
         let scene = version.scene();
         let steering = self.steering.as_mut().context("there is a walk")?;
         if !Arc::ptr_eq(steering.scene(), scene) {
+            // Another version's scene: the player still wants what was asked for.
+            let goal = steering.goal();
             *steering = Steering::new(scene, self.figures.seed);
+            steering.head_for(goal);
         }
         if self.meshes_of.is_none() {
             self.meshes_of = Some(version.number().0);
@@ -373,6 +376,7 @@ impl Show {
         said.push(Said::Text(json!({
             "say": "version", "version": version.number().0, "garment": version.mesh().name,
             "vertices": version.mesh().vertex_count, "fps": scene.fps(), "clips": scene.clips(),
+            "in_graph": answers::in_graph(scene),
             "poses": scene.pose_count(), "edges": scene.edges().len(),
             "states": version.links().state_count(), "columns": version.basis().columns(),
             "rehearsed": answers::rehearse(scene, PRESSES, 1),
@@ -424,6 +428,11 @@ impl Show {
             if pane.plain {
                 actor.be_plain()?;
             }
+            let can = !pane.coarse || actor.character.can_leave();
+            ensure!(
+                can,
+                "this version has no upsampler (explore with --upsampler), so no coarse cloth"
+            );
             actor.character.join(&self.actors[0].character);
             actor.character.stay_outside(pane.coarse);
             actors.push(actor);

@@ -223,6 +223,8 @@ def drive(checks, a, folder, browser):
         up = Up(a.toile, folder, port)
         assert up.port == port
         drawn_on(page, 10, 120)
+        least = page.evaluate("() => Math.min(0, ...window.toile.panels.plots.exact.points)")
+        assert least >= 0, f"the new line's counts were set off against the old one's: {least}"
 
     def frame_times():
         found = {}

@@ -13,6 +13,7 @@ use super::garment::GarmentError;
 use super::motion_graph::GraphReport;
 use super::reach::Reach;
 use super::{Loaded, SceneError};
+use crate::primary::PrimaryGraph;
 
 /// A garment vertex may be this deep inside the body in the rest pose (m).
 pub const INSIDE_M_MAX: f32 = 1e-3;
@@ -44,6 +45,8 @@ pub struct SceneReport {
     pub initial_dead_ends: usize,
     /// Median and 90th percentile time to reach a given clip.
     pub reach: Reach,
+    /// Clips of which the graph has no pose.
+    pub unreached: Vec<String>,
     /// Vertices of the body.
     pub body_vertices: usize,
     /// Triangles of the body.
@@ -58,6 +61,8 @@ pub struct SceneReport {
     pub cloth: GarmentFigures,
     /// Vertices held to the body.
     pub attached: usize,
+    /// Lowest and highest vertex that the body carries, in the rest pose (m).
+    pub attached_height_m: Option<[f32; 2]>,
 }
 
 /// A garment's mesh, measured in the rest pose.
@@ -99,6 +104,11 @@ pub fn report(loaded: &Loaded) -> Result<SceneReport, GarmentError> {
         .edges()
         .iter()
         .filter(|e| primary.pose(e.to).transition && !primary.pose(e.from).transition);
+    let held = scene.garment.attached.iter().map(|v| scene.garment.positions[*v as usize].y);
+    let attached_height_m = held.fold(None, |range: Option<[f32; 2]>, y| {
+        let [low, high] = range.unwrap_or([y, y]);
+        Some([low.min(y), high.max(y)])
+    });
     let heights = || body.rest_positions.iter().map(|p| p.y);
     Ok(SceneReport {
         name: scene.name.clone(),
@@ -112,6 +122,7 @@ pub fn report(loaded: &Loaded) -> Result<SceneReport, GarmentError> {
         outside: graph.as_ref().map(|g| g.outside.clone()).unwrap_or_default(),
         initial_dead_ends: (edges + 1).saturating_sub(poses),
         reach: Reach::of_graph(primary),
+        unreached: unreached(primary),
         body_vertices: body.rest_positions.len(),
         body_triangles: body.triangles.len(),
         joints: body.skeleton.joint_count(),
@@ -119,7 +130,16 @@ pub fn report(loaded: &Loaded) -> Result<SceneReport, GarmentError> {
         garment: scene.garment.name.clone(),
         cloth: check_garment(body, &scene.garment.positions, &scene.garment.triangles)?,
         attached: scene.garment.attached.len(),
+        attached_height_m,
     })
+}
+
+fn unreached(primary: &PrimaryGraph) -> Vec<String> {
+    let mut found = vec![false; primary.clips().len()];
+    let recorded = primary.poses().iter().filter(|pose| !pose.transition);
+    recorded.for_each(|pose| found[usize::from(pose.clip)] = true);
+    let missing = primary.clips().iter().zip(found).filter(|(_, found)| !found);
+    missing.map(|(clip, _)| clip.clone()).collect()
 }
 
 impl fmt::Display for SceneReport {
@@ -153,13 +173,22 @@ impl fmt::Display for SceneReport {
             seconds(self.reach.median_s),
             seconds(self.reach.p90_s)
         )?;
+        if !self.unreached.is_empty() {
+            writeln!(f, "  unreached {}: no way leads there", self.unreached.join(", "))?;
+        }
         let c = &self.cloth;
         writeln!(
             f,
-            "  garment   {}: {} vertices, {} triangles, {:.3} m^2, longest edge {:.1} mm, {} held",
-            self.garment, c.vertices, c.triangles, c.area_m2, c.edge_length_max_mm, self.attached
+            "  garment   {}: {} vertices, {} triangles, {:.3} m^2, longest edge {:.1} mm",
+            self.garment, c.vertices, c.triangles, c.area_m2, c.edge_length_max_mm
         )?;
-        write!(f, "  clearance {:.1} mm at least, in the rest pose", c.clearance_min_mm)
+        match self.attached_height_m {
+            Some([low, high]) => {
+                writeln!(f, "  held      {} vertices, {low:.2} to {high:.2} m high", self.attached)?
+            }
+            None => writeln!(f, "  held      none: it may slide off; see `attach`")?,
+        }
+        writeln!(f, "  clearance {:.1} mm at least, in the rest pose", c.clearance_min_mm)
     }
 }
 

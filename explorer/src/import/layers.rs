@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use super::character::Character;
 use super::garment::{Attachment, GarmentError, Surface};
-use super::scene_file::{GarmentTable, LayerTable};
+use super::scene_file::{GarmentTable, LayerTable, SceneFileError};
 use super::{Place, SceneError, check, read, scene_file};
 use crate::tailor::{self, Fineness, Form, Piece, sew};
 
@@ -53,7 +53,12 @@ pub(super) fn dress(
     for (index, layer) in layers.iter().enumerate() {
         let count = counts.as_ref().map(|counts| counts[index]);
         let made = wardrobe.make(layer, &worn, count);
-        let (surface, held) = made.map_err(|source| layer.error(source))?;
+        let (surface, held) = made.map_err(|source| match source {
+            // What is written in the scene file, not in the garment's.
+            GarmentError::Attach { index, problem } => place
+                .error(SceneFileError::Value { key: format!("garment.attach[{index}]"), problem }),
+            source => layer.error(source),
+        })?;
         let first = all.positions.len() as u32;
         attached.extend(held.iter().map(|v| v + first));
         all.positions.extend(&surface.positions);

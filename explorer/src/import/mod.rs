@@ -384,12 +384,21 @@ fn start_pose(file: &SceneFile, primary: &PrimaryGraph) -> Result<PoseId, SceneF
         .poses()
         .iter()
         .position(|p| !p.transition && Some(usize::from(p.clip)) == clip && p.frame == start.frame);
-    found.map(|pose| PoseId(pose as u32)).ok_or_else(|| SceneFileError::Value {
-        key: "start".to_owned(),
-        problem: format!(
-            "frame {} of clip {:?} is not in the motion graph's largest component; name another",
-            start.frame, start.clip
-        ),
+    found.map(|pose| PoseId(pose as u32)).ok_or_else(|| {
+        let recorded = || primary.poses().iter().filter(|p| !p.transition);
+        let of_clip = || recorded().filter(|p| Some(usize::from(p.clip)) == clip);
+        let frames = || of_clip().map(|p| p.frame);
+        let problem = match (clip, frames().min(), frames().max()) {
+            (None, ..) => {
+                format!("there is no clip {:?}; there are {}", start.clip, primary.clips().join(", "))
+            }
+            (_, Some(first), Some(last)) => format!(
+                "frame {} of clip {:?} is not in the motion graph's largest component; name one from {first} to {last}",
+                start.frame, start.clip
+            ),
+            _ => format!("no frame of clip {:?} is in the motion graph's largest component", start.clip),
+        };
+        SceneFileError::Value { key: "start".to_owned(), problem }
     })
 }
 

@@ -211,6 +211,7 @@ class Graphics {
     gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
     gl.bindVertexArray(null);
     this.meshes = null;
+    this.buffers = [];
     this.figures = [];
     this.slots = [];
     this.orbit = { yaw: 0.5, pitch: 0.14, distance: 3.6 };
@@ -254,7 +255,10 @@ class Graphics {
     this.slots = [];
     this.figures = [];
     gl.bindVertexArray(null);
+    for (const buffer of this.buffers) gl.deleteBuffer(buffer);
+    if (this.meshes) gl.deleteVertexArray(this.meshes.body);
     const indices = this.fill(gl.ELEMENT_ARRAY_BUFFER, take(Uint32Array, 3 * triangles));
+    this.buffers = [indices];
     const body = gl.createVertexArray();
     if (bodyVertices > 0) {
       const positions = take(Float32Array, 3 * bodyVertices);
@@ -264,14 +268,14 @@ class Graphics {
       gl.bindVertexArray(body);
       const floats = [[positions, 3], [restNormals(positions, faces), 3], [weights, 4]];
       floats.forEach(([data, size], index) => {
-        this.fill(gl.ARRAY_BUFFER, data);
+        this.buffers.push(this.fill(gl.ARRAY_BUFFER, data));
         gl.enableVertexAttribArray(index);
         gl.vertexAttribPointer(index, size, gl.FLOAT, false, 0, 0);
       });
-      this.fill(gl.ARRAY_BUFFER, bones);
+      this.buffers.push(this.fill(gl.ARRAY_BUFFER, bones));
       gl.enableVertexAttribArray(3);
       gl.vertexAttribIPointer(3, 4, gl.UNSIGNED_SHORT, 0, 0);
-      this.fill(gl.ELEMENT_ARRAY_BUFFER, faces);
+      this.buffers.push(this.fill(gl.ELEMENT_ARRAY_BUFFER, faces));
       gl.bindVertexArray(null);
     }
     this.meshes = { vertices, triangles, indices, body, bodyTriangles, joints };

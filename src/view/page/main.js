@@ -38,6 +38,7 @@ class Page {
       this.tries = 0;
       this.asked = 0;
       this.fresh = true;
+      this.panels.forget();
       at("notice").textContent = "";
     };
     socket.onmessage = event => this.take(event.data);
@@ -81,7 +82,7 @@ class Page {
         this.panels.takeInspected(said);
         break;
       case "refused":
-        this.panels.news(said.why);
+        this.panels.refused(said.why);
         break;
     }
   }
@@ -97,6 +98,11 @@ class Page {
     at("notice").textContent = "";
     this.measured.versions.push(said.version);
     if (said.clips.join() !== this.clips.join()) this.makeClips(said.clips);
+    for (const button of at("clips").children) {
+      const away = button.dataset.clip !== "" && !said.in_graph[button.dataset.clip];
+      button.disabled = away;
+      button.title = away ? "no way of the motion graph leads there" : button.title;
+    }
     this.panels.takeVersion(said);
     if (this.fresh) {
       // What was on the page before the line was lost.
@@ -146,18 +152,28 @@ class Page {
     at("clips").addEventListener("click", event => {
       const button = event.target.closest("button");
       if (button) this.steer(button.dataset.clip === "" ? null : Number(button.dataset.clip));
+      // Whoever clicked goes on with the keys; whoever came here by keys stays.
+      if (event.detail) at("view").focus();
     });
     window.addEventListener("keydown", event => {
       if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
-      if (["INPUT", "SELECT"].includes(event.target.tagName)) return;
+      // A slider needs the arrows, a button the space bar, a list everything.
+      const on = event.target.tagName;
+      if (on === "SELECT" || (on === "INPUT" && event.code.startsWith("Arrow"))) return;
+      if (on === "BUTTON" && event.code === "Space") return;
       const digit = /^Digit([1-9])$/.exec(event.code);
       if (digit && Number(digit[1]) <= this.clips.length) this.steer(Number(digit[1]) - 1);
       else if (event.code === "Escape") this.steer(null);
-      else if (ARROWS[event.code] && event.target.tagName !== "BUTTON") this.steerByWord(ARROWS[event.code]);
+      else if (ARROWS[event.code]) this.steerByWord(ARROWS[event.code]);
       else return;
       event.preventDefault();
     });
     const canvas = at("view");
+    canvas.addEventListener("webglcontextlost", event => {
+      event.preventDefault();
+      at("notice").textContent = "The graphics card was lost; waiting for it";
+    });
+    canvas.addEventListener("webglcontextrestored", () => location.reload());
     const { orbit } = this.graphics;
     canvas.addEventListener("pointermove", event => {
       if (!(event.buttons & 1)) return;
@@ -176,15 +192,19 @@ class Page {
     const pad = [...(navigator.getGamepads ? navigator.getGamepads() : [])].find(Boolean);
     if (!pad) return;
     const [x, y] = pad.axes;
-    const pressed = pad.buttons.findIndex(button => button.pressed);
+    // By the standard layout: the first six choose clips, 7 (the right trigger) runs, 12 to 15 are a cross.
+    const held = index => Boolean(pad.buttons[index] && pad.buttons[index].pressed);
+    const pressed = [0, 1, 2, 3, 4, 5].findIndex(held);
+    const cross = ["ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight"].find((_, index) => held(12 + index));
     let said = "";
-    if (pressed >= 0) said = `button ${pressed}`;
+    if (pressed >= 0 && pressed < this.clips.length) said = `button ${pressed}`;
+    else if (cross) said = cross;
     else if (y < -STICK_REST) said = pad.buttons[7] && pad.buttons[7].value > 0.3 ? "ShiftLeft" : "ArrowUp";
     else if (y > STICK_REST) said = "ArrowDown";
     else if (x < -STICK_REST) said = "ArrowLeft";
     else if (x > STICK_REST) said = "ArrowRight";
     if (said && said !== this.pad) {
-      if (pressed >= 0) this.steer(Math.min(pressed, this.clips.length - 1));
+      if (said.startsWith("button")) this.steer(pressed);
       else this.steerByWord(ARROWS[said]);
     }
     this.pad = said;

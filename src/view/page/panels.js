@@ -56,11 +56,7 @@ class Panels {
     }
     at("dial").addEventListener("input", () => this.dial());
     at("wind").addEventListener("input", () => this.blow());
-    at("speed").addEventListener("input", () => {
-      const times = Number(at("speed").value);
-      at("sped").value = times === 1 ? "1" : times.toFixed(2);
-      send({ do: "speed", times });
-    });
+    at("speed").addEventListener("input", () => this.pace());
   }
 
   open(tab) {
@@ -77,6 +73,7 @@ class Panels {
 
   // What is on the stage: asked for again after the line was lost.
   choose(command) {
+    this.chosenBefore = this.chosen;
     this.chosen = command;
     if (command.do !== "inspect") this.inspected = null;
     this.send(command);
@@ -88,6 +85,26 @@ class Panels {
     if (this.chosen) this.send(this.chosen);
     this.dial();
     this.blow();
+    this.pace();
+  }
+
+  // A new line counts from its own beginning.
+  forget() {
+    this.before = null;
+    this.timeline.marks = [];
+  }
+
+  // What was on the stage is there still.
+  refused(why) {
+    this.chosen = this.chosenBefore;
+    this.captions();
+    this.news(why);
+  }
+
+  pace() {
+    const times = Number(at("speed").value);
+    at("sped").value = times === 1 ? "1" : times.toFixed(2);
+    this.send({ do: "speed", times });
   }
 
   blow() {
@@ -105,7 +122,7 @@ class Panels {
     const before = this.version;
     this.version = said;
     at("subject").textContent = `${said.garment}, ${whole.format(said.vertices)} vertices, version ${said.version}`;
-    if (before && said.version !== before.version) {
+    if (before && said.version > before.version) {
       const change = `worst merge ${before.stats.worst_mm.toFixed(1)} to ${said.stats.worst_mm.toFixed(1)} mm`;
       this.news(`version ${said.version}: ${whole.format(said.states)} states, ${change}`);
     }
