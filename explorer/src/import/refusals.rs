@@ -145,7 +145,10 @@ fn missing_joints_are_refused() {
     let files = Files::new();
     for attach in ["{loop_near = \"Tail\"}", "{near = \"Tail\", within_m = 0.1}"] {
         files.write("scene.toml", format!("{SCENE}attach = [{attach}]"));
-        files.refused("scene.toml", &["garment.attach[0]", "no joint \"Tail\"", "Hips, Spine, Head"]);
+        files.refused(
+            "scene.toml",
+            &["garment.attach[0]", "no joint \"Tail\"", "Hips, Spine, Head"],
+        );
     }
 
     let scene = SCENE.replace("body.glb\"", "body.glb\"\nclips = [\"run.bvh\"]");
