@@ -105,9 +105,10 @@ pub async fn run(
     let ended = collect(work, &workers, &mut early, (should_stop, tags), frames, each).await;
     // Also on an error: workers still running are not waited for longer than a frame.
     let rest = workers.join(simulators);
+    // Also of what is dropped: it was simulated.
+    let counted = work.add_cpu_s(rest.iter().map(|done| done.cpu_s).sum());
     if ended.is_ok() {
-        // Also of what is dropped: it was simulated.
-        work.add_cpu_s(rest.iter().map(|done| done.cpu_s).sum())?;
+        counted?;
     }
     if matches!(ended, Ok(Ended::Interrupted(_))) {
         // What no worker had taken up again, and what they leave now.
