@@ -114,6 +114,9 @@ impl Serving {
             "127.0.0.1:0",
             "--http",
             "127.0.0.1:0",
+            // A store that tests share is compared byte by byte: nothing is added to it.
+            "--telemetry",
+            "1h",
         ];
         arguments.extend(more);
         let mut child = command(&arguments)
