@@ -44,7 +44,8 @@ fn main() {
                 (0..16).map(|c| Moving { from: limb(c, t), to: limb(c, t + 1.0 / 60.0) }).collect();
             let wind = Vec3::new(0.0, 0.0, 4.0 * (1.3 * t).sin());
             let (pins, seconds) = (&pins[..], 1.0 / 60.0);
-            let input = Input { pins, colliders: &colliders, wind, push: &[], seconds };
+            let input =
+                Input { pins, colliders: &colliders, wind, push: &[], tethers: &[], seconds };
             let start = Instant::now();
             model.step(&input, &mut state, &mut workspace).expect("finite input");
             times_us.push(start.elapsed().as_secs_f64() * 1e6);

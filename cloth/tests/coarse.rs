@@ -4,7 +4,7 @@
 //! Every threshold is derived from the scene, never from what the solver did: see the constants.
 
 use allocation_counter::measure;
-use cloth::coarse::{Capsule, Coarse, CoarseError, Input, Moving, Settings, Workspace};
+use cloth::coarse::{Capsule, Coarse, CoarseError, Input, Moving, Settings, Tether, Workspace};
 use cloth::{Environment, Material, Mesh, State, Vec3};
 use rand_core::Rng;
 use rand_pcg::Pcg64Mcg;
@@ -52,7 +52,7 @@ impl Flag {
     }
 
     fn step(&mut self, seconds: f32, wind: Vec3, colliders: &[Moving]) {
-        let input = Input { pins: &self.pins, colliders, wind, push: &[], seconds };
+        let input = Input { pins: &self.pins, colliders, wind, push: &[], tethers: &[], seconds };
         self.model.step(&input, &mut self.state, &mut self.workspace).unwrap();
     }
 
@@ -193,8 +193,14 @@ fn a_sheet_dropped_on_a_sphere_stays_outside_of_it() {
     let ball = Moving::resting(Capsule::sphere(Vec3::new(0.0, 0.5, 0.0), 0.3));
     let mut workspace = Workspace::default();
     for step in 0..600 {
-        let input =
-            Input { pins: &[], colliders: &[ball], wind: Vec3::ZERO, push: &[], seconds: DT };
+        let input = Input {
+            pins: &[],
+            colliders: &[ball],
+            wind: Vec3::ZERO,
+            push: &[],
+            tethers: &[],
+            seconds: DT,
+        };
         model.step(&input, &mut state, &mut workspace).unwrap();
         for p in &state.positions {
             let depth = 0.3 - p.distance(Vec3::new(0.0, 0.5, 0.0));
@@ -305,7 +311,8 @@ fn equal_inputs_give_equal_bits_and_nothing_is_allocated() {
             // A workspace that served another length of step before.
             let mut other = flag.state.clone();
             let (pins, wind) = (&flag.pins[..], Vec3::Z);
-            let input = Input { pins, colliders: &[], wind, push: &[], seconds: 0.03 };
+            let input =
+                Input { pins, colliders: &[], wind, push: &[], tethers: &[], seconds: 0.03 };
             flag.model.step(&input, &mut other, &mut workspace).unwrap();
         }
         flag.workspace = workspace;
@@ -335,7 +342,14 @@ fn what_makes_no_sense_is_refused_and_changes_nothing() {
     assert!(matches!(made(&[], bad), Some(CoarseError::Settings(_))));
     let mut flag = Flag::new(5, Material::default());
     let before = flag.state.clone();
-    let good = Input { pins: &flag.pins, colliders: &[], wind: Vec3::ZERO, push: &[], seconds: DT };
+    let good = Input {
+        pins: &flag.pins,
+        colliders: &[],
+        wind: Vec3::ZERO,
+        push: &[],
+        tethers: &[],
+        seconds: DT,
+    };
     let ball = [Moving::resting(Capsule::sphere(Vec3::NAN, 0.1))];
     let pins = vec![Vec3::splat(f32::INFINITY); 5];
     for input in [
@@ -376,4 +390,77 @@ fn a_thin_rod_does_not_slip_between_the_points() {
         }
         assert_eq!(ahead > 0.0, takes_along, "{spacing_m}: {ahead} m before the rod");
     }
+}
+
+#[test]
+fn a_tether_holds_a_point_in_its_room_and_on_its_side() {
+    let mut flag = Flag::new(8, Material::default());
+    let (corner, wind) = (63, Vec3::new(0.0, 0.0, 12.0));
+    let at = flag.state.positions[corner];
+    let tether =
+        Tether { point: corner as u32, at, reach_m: 0.1, normal: Vec3::NEG_Z, floor_m: -0.02 };
+    for _ in 0..120 {
+        let (pins, tethers) = (&flag.pins[..], &[tether][..]);
+        let input = Input { pins, colliders: &[], wind, push: &[], tethers, seconds: DT };
+        flag.model.step(&input, &mut flag.state, &mut flag.workspace).unwrap();
+        let off = flag.state.positions[corner] - at;
+        assert!(off.length() <= 0.1 + 1e-5 && off.z <= 0.02 + 1e-5, "{off}");
+    }
+    assert!(flag.state.positions[60].z > 0.1, "what is not held flies");
+    // One that is pinned is led, whatever holds it.
+    let led = Tether { point: 0, at: at + Vec3::X, ..tether };
+    let (pins, tethers) = (&flag.pins[..], &[led][..]);
+    let input = Input { pins, colliders: &[], wind, push: &[], tethers, seconds: DT };
+    flag.model.step(&input, &mut flag.state, &mut flag.workspace).unwrap();
+    assert!(flag.state.positions[0].distance(flag.pins[0]) < 1e-6);
+    for bad in [
+        Tether { point: 64, ..tether },
+        Tether { at: Vec3::NAN, ..tether },
+        Tether { reach_m: -1.0, ..tether },
+        Tether { normal: Vec3::splat(2.0), ..tether },
+        Tether { floor_m: f32::INFINITY, ..tether },
+    ] {
+        let input = Input { tethers: &[bad], ..input };
+        let refused = flag.model.step(&input, &mut flag.state, &mut flag.workspace);
+        assert!(matches!(refused, Err(CoarseError::Unsound { what: "tether", .. })), "{bad:?}");
+    }
+}
+
+/// Two sheets, one above the other, that are thrown at each other.
+#[test]
+fn layers_that_keep_apart_do_not_pass_through_each_other() {
+    const N: u32 = 8;
+    let lower = sheet(N);
+    let flat = |p: &Vec3, y: f32| Vec3::new(p.x, y, p.y);
+    let mut points: Vec<Vec3> = lower.rest_positions().iter().map(|p| flat(p, 1.0)).collect();
+    points.extend(lower.rest_positions().iter().map(|p| flat(p, 1.3)));
+    let mut triangles = lower.triangles().to_vec();
+    triangles.extend(lower.triangles().iter().map(|t| t.map(|v| v + N * N)));
+    let mesh = Mesh::new(points, triangles).unwrap();
+    let environment = Environment { gravity: Vec3::ZERO, ..Environment::default() };
+    let lowest_gap = |apart_m: f32| {
+        let settings = Settings { apart_m, ..Settings::default() };
+        let material = Material { drag: 0.0, ..Material::default() };
+        let model = Coarse::new(mesh.clone(), material, environment, &[], settings).unwrap();
+        let mut state = model.rest_state();
+        let (half, mut workspace) = ((N * N) as usize, Workspace::default());
+        for (i, v) in state.velocities.iter_mut().enumerate() {
+            *v = Vec3::Y * if i < half { 2.0 } else { -2.0 };
+        }
+        let (none, wind) = (&[][..], Vec3::ZERO);
+        let mut least = f32::INFINITY;
+        for step in 0..60 {
+            let input =
+                Input { pins: &[], colliders: &[], wind, push: none, tethers: &[], seconds: DT };
+            let run = |state: &mut State, ws: &mut Workspace| model.step(&input, state, ws);
+            let asked = measure(|| run(&mut state, &mut workspace).unwrap());
+            assert!(step < 20 || asked.count_total == 0, "it allocates");
+            let gap = |i: usize| state.positions[half + i].y - state.positions[i].y;
+            least = (0..half).map(gap).fold(least, f32::min);
+        }
+        least
+    };
+    assert!(lowest_gap(0.0) < -0.3, "they pass through each other if let");
+    let least = lowest_gap(0.1);
+    assert!(least > 0.05, "{least} m");
 }

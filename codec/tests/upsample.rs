@@ -4,8 +4,8 @@ use allocation_counter::measure;
 use codec::kernel::Set;
 use codec::kernel::normals::Faces;
 use codec::upsample::{
-    Binding, Capsule, Class, Drive, Fabric, Mode, Parts, Pin, Place, Skin, Stepping, Transform,
-    UpsampleError, Upsampler, WHOLE, Weights, Workspace,
+    Binding, Capsule, Class, Drive, Fabric, Mode, Parts, Pin, Place, Skin, Stepping, Tether,
+    Transform, UpsampleError, Upsampler, WHOLE, Weights, Workspace,
 };
 use proptest::prelude::*;
 
@@ -33,6 +33,11 @@ fn bilinear() -> Vec<f32> {
     grid(FINE).into_iter().flat_map(row).collect()
 }
 
+fn skin(vertex: u32, share: u16, binding: Binding) -> Skin {
+    let rest = grid(FINE)[vertex as usize];
+    Skin { vertex, share, binding, rest, normal: [0.0; 3], floor_m: 0.0 }
+}
+
 fn sample(bits: u8) -> Parts {
     let corner = |v: u32| Place { vertices: [v, v, v], weights: [1.0, 0.0] };
     let binding = Binding::new([0, 1, 0, 0], [0.75, 0.25, 0.0, 0.0]);
@@ -41,6 +46,7 @@ fn sample(bits: u8) -> Parts {
         triangles: vec![[0, 2, 1], [1, 2, 3]],
         places: [0, 4, 20, 24].map(corner).to_vec(),
         pins: vec![Pin { point: 0, binding: Binding::of(0) }, Pin { point: 1, binding }],
+        tethers: vec![],
         capsules: vec![Capsule { joint: 1, ends: [[0.0; 3], [0.0, 0.5, 0.0]], radius: 0.125 }],
         fabric: Fabric {
             density: 0.25,
@@ -62,13 +68,11 @@ fn sample(bits: u8) -> Parts {
             damping_per_s: 0.5,
             expansion_m: 0.25,
             spacing_m: 0.0,
+            apart_m: 0.0,
         },
         skins: (0..5)
-            .map(|v| Skin { vertex: v, share: WHOLE, binding, rest: grid(FINE)[v as usize] })
-            .chain((5..10).map(|v| {
-                let rest = grid(FINE)[v as usize];
-                Skin { vertex: v, share: WHOLE / 2, binding: Binding::of(0), rest }
-            }))
+            .map(|v| skin(v, WHOLE, binding))
+            .chain((5..10).map(|v| skin(v, WHOLE / 2, Binding::of(0))))
             .collect(),
         modes: vec![Mode {
             frequency_hz: 2.0,
@@ -87,6 +91,18 @@ fn sample(bits: u8) -> Parts {
         max_m: 0.03125,
         weights: Weights::round(4, &bilinear(), bits).unwrap(),
     }
+}
+
+/// With what the second version has more.
+fn held() -> Parts {
+    let mut parts = sample(8);
+    parts.stepping.apart_m = 0.0625;
+    let binding = Binding::new([0, 1, 0, 0], [0.5, 0.5, 0.0, 0.0]);
+    let normal = [0.0, 0.0, 1.0];
+    parts.tethers.push(Tether { point: 2, binding, reach_m: 0.25, normal, floor_m: -0.125 });
+    parts.skins[9].normal = [0.0, 1.0, 0.0];
+    parts.skins[9].floor_m = 0.5;
+    parts
 }
 
 const IDENTITY: Transform = [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 0.]];
@@ -119,8 +135,8 @@ fn the_bytes_are_a_promise() {
 
 #[test]
 fn every_truncation_and_every_flipped_byte_is_survived() {
-    for bits in [8, 11, 13, 16] {
-        let bytes = sample(bits).encode().unwrap();
+    for parts in [sample(8), sample(11), sample(13), sample(16), held()] {
+        let bytes = parts.encode().unwrap();
         for end in 0..bytes.len() {
             assert!(Parts::decode(&bytes[..end]).is_err(), "cut to {end}");
         }
@@ -141,7 +157,11 @@ fn every_truncation_and_every_flipped_byte_is_survived() {
 #[test]
 fn what_makes_no_sense_is_refused_by_name() {
     type Spoil = fn(&mut Parts);
-    let spoils: [(&str, Spoil); 9] = [
+    let spoils: [(&str, Spoil); 13] = [
+        ("tether 0", |p| p.tethers = vec![Tether { point: 0, ..held().tethers[0] }]),
+        ("tether 0", |p| p.tethers = vec![Tether { reach_m: -1.0, ..held().tethers[0] }]),
+        ("tether 1", |p| p.tethers = vec![held().tethers[0]; 2]),
+        ("skinned vertex 9", |p| p.skins[9].normal = [1.0, 1.0, 0.0]),
         ("pin 1", |p| p.pins[1].point = 0),
         ("pin 0", |p| p.pins[0].binding.shares[0] = 7),
         ("place 2", |p| p.places[2].vertices[1] = 25),
@@ -160,9 +180,41 @@ fn what_makes_no_sense_is_refused_by_name() {
     }
     assert!(matches!(Parts::decode(b"TBgX"), Err(UpsampleError::Magic(_))));
     let mut newer = sample(16).encode().unwrap();
-    newer[4] = 2;
-    assert_eq!(Parts::decode(&newer), Err(UpsampleError::Version(2)));
+    newer[4] = 3;
+    assert_eq!(Parts::decode(&newer), Err(UpsampleError::Version(3)));
     assert!(Weights::round(4, &[0.0; 8], 7).is_err() && Weights::round(4, &[0.0; 7], 12).is_err());
+}
+
+#[test]
+fn the_second_version_is_a_promise_as_well() {
+    let bytes = held().encode().unwrap();
+    assert_eq!(Parts::decode(&bytes).unwrap(), held());
+    assert_eq!(bytes[4..6], [2, 0]);
+    // What keeps apart, and one tether, after the first version's header.
+    assert_eq!(bytes[96..104], [0, 0, 0x80, 0x3d, 1, 0, 0, 0]);
+    assert_eq!(bytes.len(), sample(8).encode().unwrap().len() + 8 + 38 + 16 * 10);
+}
+
+#[test]
+fn what_is_held_comes_with_the_skin_and_stays_above_its_floor() {
+    let upsampler = Upsampler::new(held()).unwrap();
+    let (free, _) = frame(&Upsampler::new(sample(8)).unwrap(), Set::Scalar);
+    let (guarded, _) = frame(&upsampler, Set::Scalar);
+    // Vertex 9 is half on joint 0, which rests, and half 2 m higher; its floor is half a metre up.
+    let rest = grid(FINE)[9];
+    assert!((free[28] - rest[1] - 1.0).abs() < 1e-3, "{}", free[28]);
+    assert_eq!(guarded[28].to_bits(), free[28].to_bits(), "it is above already");
+    let mut parts = held();
+    parts.skins[9].floor_m = 1.5;
+    let (lifted, _) = frame(&Upsampler::new(parts).unwrap(), Set::Scalar);
+    assert!((lifted[28] - rest[1] - 1.5).abs() < 1e-3, "{}", lifted[28]);
+    assert!((lifted[27] - free[27]).abs() < 1e-6);
+    let raised = [[1., 0., 0., 0.], [0., 1., 0., 1.], [0., 0., 1., 0.]];
+    let mut found = Vec::new();
+    upsampler.tethers(&[IDENTITY, raised], &mut found);
+    assert_eq!(found.len(), 1);
+    let corner = grid(2)[2];
+    assert!((found[0].at[1] - corner[1] - 0.5).abs() < 1e-4 && found[0].normal[2] > 0.999);
 }
 
 /// One frame: points moved by (1, 2, 3), joint 1 lifted by 1 m.

@@ -152,6 +152,7 @@ fn coarse(upsampler: &Upsampler) -> Result<Coarse, UpsampledError> {
         damping_per_s: s.damping_per_s,
         expansion_m: s.expansion_m,
         spacing_m: s.spacing_m,
+        apart_m: s.apart_m,
     };
     let mesh = Mesh::new(points, triangles)?;
     Ok(Coarse::new(mesh, material, environment, &pinned, settings)?)

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use cloth::coarse::{Input, Moving};
+use cloth::coarse::{Input, Moving, Tether};
 use cloth::{Pose, Rigid, State, Vec3};
-use codec::upsample::{Drive, Transform};
+use codec::upsample::{Drive, Held, Transform};
 
 use super::draw::Draw;
 use super::{Forces, Upsampled, transform};
@@ -45,6 +45,10 @@ struct Scratch {
     pins_m: Vec<[f32; 3]>,
     pins: Vec<Vec3>,
     capsules: Vec<Moving>,
+    held: Vec<Held>,
+    tethers: Vec<Tether>,
+    /// By tether, what the cloth at leaving was beyond its reach and its floor (m).
+    slack: Vec<[f32; 2]>,
     pushes: Vec<Vec3>,
     coarse_m: Vec<f32>,
 }
@@ -117,6 +121,9 @@ impl Run {
         if !self.upsample(upsampled, &hips) {
             return false;
         }
+        let s = &mut self.scratch;
+        s.lead(upsampled, &Rigid::IDENTITY);
+        s.slacken(upsampled, &self.state.positions);
         for ((out, shown), made) in self.residual.iter_mut().zip(&self.before).zip(&self.now) {
             *out = shown - made;
         }
@@ -148,7 +155,7 @@ impl Run {
         self.scratch.fine.advance(&upsampled.upsampler, 1.0 / way.scene.fps(), wind);
         forces.pass();
         let made = self.upsample(&upsampled, &way.to.hips(way.scene));
-        let left = BLEND_FRAMES.saturating_sub(self.frames as usize) as f32 / BLEND_FRAMES as f32;
+        let left = left(self.frames);
         if left > 0.0 {
             self.now.iter_mut().zip(&self.residual).for_each(|(x, r)| *x += left * r);
         }
@@ -186,6 +193,7 @@ impl Run {
             Moving { from: at(&s.joints_before), to: at(&s.joints) }
         });
         s.capsules.extend(moving);
+        s.hold(upsampled, left(self.frames));
         s.pushes.clear();
         if !forces.pushes.is_empty() {
             s.pushes.extend(self.state.positions.iter().map(|x| forces.acceleration(*x)));
@@ -197,11 +205,13 @@ impl Run {
             self.draw.add((positions, velocities), begun, (frame_s, seconds), &mut s.pushes);
             self.draw.pass(seconds);
         }
+        let body = !self.draw.passes_body();
         let input = Input {
             pins: &s.pins,
-            colliders: if self.draw.passes_body() { &[] } else { &s.capsules },
+            colliders: if body { &s.capsules } else { &[] },
             wind: forces.wind,
             push: &s.pushes,
+            tethers: if body { &s.tethers } else { &[] },
             seconds,
         };
         upsampled.coarse.step(&input, &mut self.state, &mut s.coarse).is_ok()
@@ -246,7 +256,37 @@ impl Scratch {
         let joints = self.joints.iter().zip(&upsampled.to_joint);
         self.transforms.extend(joints.map(|(j, r)| transform(&then.after(&j.after(r)))));
         upsampled.upsampler.pins(&self.transforms, &mut self.pins_m);
+        upsampled.upsampler.tethers(&self.transforms, &mut self.held);
     }
+
+    /// How far the cloth at `positions` is beyond its tethers, which give way by this at first.
+    fn slacken(&mut self, upsampled: &Upsampled, positions: &[Vec3]) {
+        let tethers = upsampled.upsampler.parts().tethers.iter().zip(&self.held);
+        self.slack.clear();
+        self.slack.extend(tethers.map(|(t, held)| {
+            let off = positions[usize::from(t.point)] - Vec3::from_array(held.at);
+            let low = t.floor_m - Vec3::from_array(held.normal).dot(off);
+            [(off.length() - t.reach_m).max(0.0), low.max(0.0)]
+        }));
+    }
+
+    /// The tethers where the joints are; `left` of their slack is.
+    fn hold(&mut self, upsampled: &Upsampled, left: f32) {
+        let tethers = upsampled.upsampler.parts().tethers.iter().zip(&self.held);
+        self.tethers.clear();
+        self.tethers.extend(tethers.zip(&self.slack).map(|((t, held), [far, low])| Tether {
+            point: t.point.into(),
+            at: Vec3::from_array(held.at),
+            reach_m: t.reach_m + left * far,
+            normal: Vec3::from_array(held.normal),
+            floor_m: t.floor_m - left * low,
+        }));
+    }
+}
+
+/// What is left, after so many frames, of what was there at leaving.
+fn left(frames: u32) -> f32 {
+    BLEND_FRAMES.saturating_sub(frames as usize) as f32 / BLEND_FRAMES as f32
 }
 
 fn empty() -> Pose {

@@ -58,12 +58,15 @@ pub fn stored() -> Stored {
         share: WHOLE,
         binding: Binding::of(0),
         rest: grid(FINE)[vertex],
+        normal: [0.0; 3],
+        floor_m: 0.0,
     };
     Stored {
         points: grid(COARSE),
         triangles: triangles(COARSE as u32).iter().map(|t| t.map(|v| v as u16)).collect(),
         places: (0..COARSE * COARSE).map(place).collect(),
         pins: (0..COARSE as u16).map(|point| Pin { point, binding: Binding::of(0) }).collect(),
+        tethers: vec![],
         capsules: vec![],
         fabric: Fabric {
             density: 0.2,
@@ -85,6 +88,7 @@ pub fn stored() -> Stored {
             damping_per_s: 4.0,
             expansion_m: 0.0,
             spacing_m: 0.0,
+            apart_m: 0.0,
         },
         skins: (0..FINE).map(skin).collect(),
         modes: vec![],

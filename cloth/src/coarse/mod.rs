@@ -11,11 +11,13 @@
 //! Whatever happens to it, a state stays finite and bounded: speeds are limited, pins that jump take
 //! the cloth along, a pass cannot overshoot, and no point gets further from its pin than cloth reaches.
 
+mod apart;
 mod between;
 mod collide;
 mod contact;
 mod elastic;
 mod envelope;
+mod tether;
 
 use glam::{Vec3, Vec3A};
 
@@ -31,6 +33,7 @@ use collide::Swept;
 pub use collide::{Capsule, Moving};
 use elastic::{Constants, Group};
 use envelope::Envelope;
+pub use tether::Tether;
 
 /// Points of a coarse mesh, at most.
 pub const POINTS_MAX: usize = 1024;
@@ -65,6 +68,9 @@ pub struct Settings {
     /// Besides the points, places along the edges keep off colliders, no further apart than this (m):
     /// a thin limb does not slip between points. 0: the points alone.
     pub spacing_m: f32,
+    /// Points that are no neighbours keep this far apart (m), so that layers do not pass through each
+    /// other; 0: they do not mind each other.
+    pub apart_m: f32,
 }
 
 impl Default for Settings {
@@ -76,6 +82,7 @@ impl Default for Settings {
             damping_per_s: 0.5,
             expansion_m: 0.0,
             spacing_m: 0.0,
+            apart_m: 0.0,
         }
     }
 }
@@ -116,6 +123,8 @@ pub struct Input<'a> {
     pub wind: Vec3,
     /// Acceleration of each point on top of gravity (m/s^2): a push. Empty for none.
     pub push: &'a [Vec3],
+    /// Points that something leaves some room only, such as the skin beneath them.
+    pub tethers: &'a [Tether],
     /// Length of the step (s), within [`STEP_S`].
     pub seconds: f32,
 }
@@ -132,6 +141,8 @@ pub struct Workspace {
     clear: Vec<[f32; NEAREST]>,
     /// The same for places along edges.
     near_between: Vec<[u16; NEAREST]>,
+    /// Points that may come too near each other.
+    apart: apart::Pairs,
     start: Vec<Vec3A>,
     aim: Vec<Vec3A>,
     x: Vec<Vec3A>,
@@ -158,7 +169,7 @@ pub enum CoarseError {
     /// Settings that make no sense.
     #[error(
         "settings {0:?}: 1..=64 passes, up to 64 sweeps, compression 0..=1, damping 0..=100 a \
-             second, expansion 0..=1 m, spacing 0 or 0.01..=1 m"
+             second, expansion 0..=1 m, spacing 0 or 0.01..=1 m, apart 0..=1 m"
     )]
     Settings(Settings),
     /// A list of another length.
@@ -203,12 +214,13 @@ impl Coarse {
                 return Err(CoarseError::Pinned(*pin));
             }
         }
-        let Settings { passes, sweeps, compression, damping_per_s, expansion_m, spacing_m } =
-            settings;
+        let Settings { passes, sweeps, compression, damping_per_s, .. } = settings;
+        let Settings { expansion_m, spacing_m, apart_m, .. } = settings;
         let fine =
             (1..=64).contains(&passes) && sweeps <= 64 && (0.0..=100.0).contains(&damping_per_s);
         let spaced = spacing_m.to_bits() == 0 || (0.01..=1.0).contains(&spacing_m);
-        let shares = (0.0..=1.0).contains(&compression) && (0.0..=1.0).contains(&expansion_m);
+        let unit = |x: f32| (0.0..=1.0).contains(&x);
+        let shares = unit(compression) && unit(expansion_m) && unit(apart_m);
         if !fine || !shares || !spaced {
             return Err(CoarseError::Settings(settings));
         }
@@ -278,15 +290,19 @@ impl Coarse {
         let shift = self.begin(input, state, ws);
         self.aim(input, state, ws);
         self.find_near(input, shift, ws);
+        self.find_pairs(ws);
         for _ in 0..self.settings.passes {
             self.pass(dt, ws);
             self.push_out(ws);
+            self.hold_tethers(input.tethers, ws);
         }
         self.hold_leashes(ws);
         for _ in 0..self.settings.sweeps {
             self.shorten(ws);
+            self.keep_apart(ws);
             self.push_out(ws);
             self.push_out_between(ws);
+            self.hold_tethers(input.tethers, ws);
         }
         self.hold_leashes(ws);
         self.end(dt, state, ws);
@@ -315,6 +331,9 @@ impl Coarse {
         bad("position", &state.positions)?;
         bad("velocity", &state.velocities)?;
         bad("wind", &[input.wind])?;
+        if let Some(index) = input.tethers.iter().position(|t| !t.is_sound(count, FAR)) {
+            return Err(CoarseError::Unsound { what: "tether", index });
+        }
         let sound = |m: &Moving| m.from.is_sound(FAR) && m.to.is_sound(FAR);
         if let Some(index) = input.colliders.iter().position(|m| !sound(m)) {
             return Err(CoarseError::Unsound { what: "collider", index });

@@ -2,22 +2,27 @@
 
 use super::{
     Binding, CAPSULES_MAX, CLASSES_MAX, COARSE_MAX, Capsule, Class, FINE_MAX, Fabric, MODES_MAX,
-    Mode, Parts, Pin, Place, STEPS_MAX, Skin, Stepping, UpsampleError, Upsampler, Weights,
+    Mode, Parts, Pin, Place, STEPS_MAX, Skin, Stepping, Tether, UpsampleError, Upsampler, Weights,
     check_count,
 };
 
 const MAGIC: [u8; 4] = *b"TUps";
-pub(super) const VERSION: u16 = 1;
+/// The first has no tethers, floors or points that keep apart, and is still written where there are none.
+pub(super) const VERSIONS: [u16; 2] = [1, 2];
 const HEADER_BYTES: usize = 96;
+/// What the second version's header has more.
+const MORE_BYTES: usize = 8;
 
 /// Counts of a header: what the number of bytes depends on.
 #[derive(Debug, Clone, Copy)]
 struct Counts {
+    version: u16,
     bits: usize,
     coarse: usize,
     fine: usize,
     triangles: usize,
     pins: usize,
+    tethers: usize,
     capsules: usize,
     skins: usize,
     modes: usize,
@@ -28,12 +33,17 @@ struct Counts {
 
 impl Counts {
     fn of(parts: &Parts) -> Self {
+        let held = |s: &Skin| s.normal.iter().chain([&s.floor_m]).any(|x| x.to_bits() != 0);
+        let apart = parts.stepping.apart_m.to_bits() != 0;
+        let newer = apart || !parts.tethers.is_empty() || parts.skins.iter().any(held);
         Self {
+            version: VERSIONS[usize::from(newer)],
             bits: usize::from(parts.weights.bits),
             coarse: parts.points.len(),
             fine: parts.weights.units.len(),
             triangles: parts.triangles.len(),
             pins: parts.pins.len(),
+            tethers: parts.tethers.len(),
             capsules: parts.capsules.len(),
             skins: parts.skins.len(),
             modes: parts.modes.len(),
@@ -49,6 +59,7 @@ impl Counts {
         check_count("weights", self.coarse * self.fine, 1, STEPS_MAX)?;
         check_count("coarse triangles", self.triangles, 1, 2 * COARSE_MAX)?;
         check_count("pins", self.pins, 0, self.coarse)?;
+        check_count("tethers", self.tethers, 0, self.coarse)?;
         check_count("capsules", self.capsules, 0, CAPSULES_MAX)?;
         check_count("skinned vertices", self.skins, 0, self.fine)?;
         check_count("modes", self.modes, 0, MODES_MAX)?;
@@ -58,7 +69,10 @@ impl Counts {
 
     /// Every count is within its limit, so this cannot overflow.
     fn bytes(&self) -> usize {
+        let more = if self.version == VERSIONS[0] { 0 } else { MORE_BYTES + 16 * self.skins };
         HEADER_BYTES
+            + more
+            + self.tethers * 38
             + self.coarse * (12 + 20)
             + self.triangles * 6
             + self.pins * 18
@@ -83,6 +97,11 @@ impl Parts {
         counts.check()?;
         let mut out = Vec::with_capacity(counts.bytes());
         self.put_header(&counts, &mut out);
+        let newer = counts.version != VERSIONS[0];
+        if newer {
+            floats(&mut out, &[self.stepping.apart_m]);
+            out.extend((counts.tethers as u32).to_le_bytes());
+        }
         self.points.iter().for_each(|p| floats(&mut out, p));
         for place in &self.places {
             place.vertices.iter().for_each(|v| out.extend(v.to_le_bytes()));
@@ -92,6 +111,12 @@ impl Parts {
         for pin in &self.pins {
             shorts(&mut out, &[pin.point]);
             put_binding(&mut out, &pin.binding);
+        }
+        for t in &self.tethers {
+            shorts(&mut out, &[t.point]);
+            put_binding(&mut out, &t.binding);
+            floats(&mut out, &[t.reach_m]);
+            put_guard(&mut out, &t.normal, t.floor_m);
         }
         for c in &self.capsules {
             shorts(&mut out, &[c.joint]);
@@ -103,6 +128,9 @@ impl Parts {
             shorts(&mut out, &[s.share]);
             put_binding(&mut out, &s.binding);
             floats(&mut out, &s.rest);
+            if newer {
+                put_guard(&mut out, &s.normal, s.floor_m);
+            }
         }
         for m in &self.modes {
             floats(&mut out, &[m.frequency_hz, m.damping_per_s, m.wind_m_s, m.unit_m]);
@@ -123,7 +151,7 @@ impl Parts {
 
     fn put_header(&self, c: &Counts, out: &mut Vec<u8>) {
         out.extend(MAGIC);
-        shorts(out, &[VERSION, c.bits as u16, c.coarse as u16, c.triangles as u16]);
+        shorts(out, &[c.version, c.bits as u16, c.coarse as u16, c.triangles as u16]);
         shorts(out, &[c.pins as u16, c.capsules as u16, c.modes as u16, c.classes as u16]);
         for count in [c.fine, c.skins, c.members] {
             out.extend((count as u32).to_le_bytes());
@@ -150,13 +178,19 @@ impl Parts {
             return Err(UpsampleError::Magic(magic));
         }
         let version = at.short();
-        if version != VERSION {
+        if !VERSIONS.contains(&version) {
             return Err(UpsampleError::Version(version));
         }
         let [bits, coarse, triangles, pins, capsules, modes, classes] =
             std::array::from_fn(|_| usize::from(at.short()));
         let [fine, skins, members] = std::array::from_fn(|_| at.long() as usize);
+        let mut more = Bytes(bytes.get(HEADER_BYTES..).unwrap_or_default());
+        let newer = version != VERSIONS[0];
+        let (apart_m, tethers) =
+            if newer { (more.float(), more.long() as usize) } else { (0.0, 0) };
         let counts = Counts {
+            version,
+            tethers,
             bits,
             coarse,
             fine,
@@ -173,7 +207,8 @@ impl Parts {
             let (expected, actual) = (counts.bytes() as u64, bytes.len() as u64);
             return Err(UpsampleError::Length { expected, actual });
         }
-        let parts = Self::take(&counts, &mut at)?;
+        let mut parts = Self::take(&counts, &mut at)?;
+        parts.stepping.apart_m = apart_m;
         parts.check()?;
         Ok(parts)
     }
@@ -182,6 +217,10 @@ impl Parts {
         let (fabric, mut stepping) = (at.fabric(), at.stepping()?);
         let [rms_m, max_m, spacing_m] = at.floats();
         stepping.spacing_m = spacing_m;
+        let newer = counts.version != VERSIONS[0];
+        if newer {
+            let _: [u8; MORE_BYTES] = at.take();
+        }
         let points = at.list(counts.coarse, Bytes::floats);
         let places = at.list(counts.coarse, |at| Place {
             vertices: std::array::from_fn(|_| at.long()),
@@ -189,6 +228,10 @@ impl Parts {
         });
         let triangles = at.list(counts.triangles, |at| std::array::from_fn(|_| at.short()));
         let pins = at.list(counts.pins, |at| Pin { point: at.short(), binding: at.binding() });
+        let tethers = at.list(counts.tethers, |at| {
+            let (point, binding, reach_m) = (at.short(), at.binding(), at.float());
+            Tether { point, binding, reach_m, normal: at.floats(), floor_m: at.float() }
+        });
         let capsules = at.list(counts.capsules, |at| Capsule {
             joint: at.short(),
             ends: std::array::from_fn(|_| at.floats()),
@@ -199,6 +242,8 @@ impl Parts {
             share: at.short(),
             binding: at.binding(),
             rest: at.floats(),
+            normal: if newer { at.floats() } else { [0.0; 3] },
+            floor_m: if newer { at.float() } else { 0.0 },
         });
         let modes = at.list(counts.modes, |at| {
             let [frequency_hz, damping_per_s, wind_m_s, unit_m] = at.floats();
@@ -214,6 +259,7 @@ impl Parts {
             triangles,
             places,
             pins,
+            tethers,
             capsules,
             fabric,
             stepping,
@@ -291,7 +337,7 @@ impl Bytes<'_> {
         }
         let [compression, damping_per_s, expansion_m] = self.floats();
         let ground = ground == 1;
-        let spacing_m = 0.0;
+        let (spacing_m, apart_m) = (0.0, 0.0);
         Ok(Stepping {
             steps,
             passes,
@@ -301,6 +347,7 @@ impl Bytes<'_> {
             damping_per_s,
             expansion_m,
             spacing_m,
+            apart_m,
         })
     }
 
@@ -333,6 +380,11 @@ fn shorts(out: &mut Vec<u8>, numbers: &[u16]) {
 fn put_binding(out: &mut Vec<u8>, binding: &Binding) {
     shorts(out, &binding.joints);
     shorts(out, &binding.shares);
+}
+
+fn put_guard(out: &mut Vec<u8>, normal: &[f32; 3], floor_m: f32) {
+    floats(out, normal);
+    floats(out, &[floor_m]);
 }
 
 /// Two's complement of `bits` each, the lowest bit first; zeros up to the last byte's end.

@@ -83,6 +83,42 @@ pub struct Skin {
     pub binding: Binding,
     /// Where it lies in the rest pose (m).
     pub rest: [f32; 3],
+    /// Out of the body, in the rest pose; zero where nothing holds the vertex off it.
+    pub normal: [f32; 3],
+    /// Along it from where the skin leads the vertex, it never lies lower (m).
+    pub floor_m: f32,
+}
+
+impl Skin {
+    /// Whether something holds the vertex off the body.
+    pub fn is_guarded(&self) -> bool {
+        self.normal.iter().any(|x| *x != 0.0)
+    }
+}
+
+/// A coarse point that the skin leaves some room: cloth near the body neither leaves it nor gets
+/// into it, whatever gap there is between colliders.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tether {
+    /// Which point.
+    pub point: u16,
+    /// What leads its rest position.
+    pub binding: Binding,
+    /// How far from there it gets (m).
+    pub reach_m: f32,
+    /// Out of the body, in the rest pose.
+    pub normal: [f32; 3],
+    /// Along it from there, it never lies lower (m).
+    pub floor_m: f32,
+}
+
+/// Where a tether is in a frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Held {
+    /// Where the skin leads the point (m).
+    pub at: [f32; 3],
+    /// Unit vector out of the body; zero where there is none.
+    pub normal: [f32; 3],
 }
 
 /// A pair of oscillatory modes (Kavan et al. 2011, section 5).
@@ -158,6 +194,8 @@ pub struct Stepping {
     /// Places along coarse edges keep off capsules as well, no further apart than this (m); 0: points
     /// alone.
     pub spacing_m: f32,
+    /// Coarse points that are no neighbours keep this far apart (m); 0: they do not mind each other.
+    pub apart_m: f32,
 }
 
 /// Everything that is stored of an upsampler.
@@ -171,6 +209,8 @@ pub struct Parts {
     pub places: Vec<Place>,
     /// Coarse points that are led; ascending.
     pub pins: Vec<Pin>,
+    /// Coarse points that the skin leaves some room; ascending, none of them a pin.
+    pub tethers: Vec<Tether>,
     /// What the coarse cloth keeps off.
     pub capsules: Vec<Capsule>,
     /// Its constants.
@@ -210,7 +250,7 @@ pub enum UpsampleError {
     #[error("not an upsampler: it begins with {0:02x?}")]
     Magic([u8; 4]),
     /// A version that this build does not know.
-    #[error("upsampler of version {0}; this build reads version {known}", known = bytes::VERSION)]
+    #[error("upsampler of version {0}; this build reads up to {known}", known = bytes::VERSIONS[1])]
     Version(u16),
     /// Another number of bytes than the header asks for.
     #[error("upsampler of {actual} bytes, but its header asks for {expected}")]
@@ -297,6 +337,7 @@ impl Parts {
         check_count("places", self.places.len(), coarse, coarse)?;
         check_count("coarse triangles", self.triangles.len(), 1, 2 * COARSE_MAX)?;
         check_count("pins", self.pins.len(), 0, coarse)?;
+        check_count("tethers", self.tethers.len(), 0, coarse)?;
         check_count("capsules", self.capsules.len(), 0, CAPSULES_MAX)?;
         check_count("skinned vertices", self.skins.len(), 0, fine)?;
         check_count("modes", self.modes.len(), 0, MODES_MAX)?;
@@ -318,6 +359,12 @@ impl Parts {
         })?;
         all("pin", &self.pins, |pin| usize::from(pin.point) < coarse && pin.binding.is_sound())?;
         ascending("pin", &self.pins, |pin| pin.point.into())?;
+        all("tether", &self.tethers, |t| {
+            let led = self.pins.binary_search_by_key(&t.point, |pin| pin.point).is_ok();
+            let sound = t.binding.is_sound() && is_guard(&t.normal, t.floor_m);
+            usize::from(t.point) < coarse && !led && sound && (0.0..=FAR_M).contains(&t.reach_m)
+        })?;
+        ascending("tether", &self.tethers, |t| t.point.into())?;
         all("capsule", &self.capsules, |c| {
             let placed = usize::from(c.joint) < JOINTS_MAX && c.ends.iter().all(near);
             placed && (0.0..=FAR_M).contains(&c.radius)
@@ -327,7 +374,8 @@ impl Parts {
         let numbers = (0.0..=1.0).contains(&s.compression)
             && (0.0..=100.0).contains(&s.damping_per_s)
             && (0.0..=1.0).contains(&s.expansion_m)
-            && (0.0..=1.0).contains(&s.spacing_m);
+            && (0.0..=1.0).contains(&s.spacing_m)
+            && (0.0..=1.0).contains(&s.apart_m);
         let f = &self.fabric;
         let weft = f.weft.unwrap_or(f.stretch);
         let fabric = [f.density, f.stretch, weft, f.shear, f.bend, f.friction, f.drag]
@@ -343,7 +391,8 @@ impl Parts {
 
     fn check_fine(&self, fine: usize) -> Result<(), UpsampleError> {
         all("skinned vertex", &self.skins, |s| {
-            (s.vertex as usize) < fine && s.binding.is_sound() && near(&s.rest)
+            let guard = is_guard(&s.normal, s.floor_m);
+            (s.vertex as usize) < fine && s.binding.is_sound() && near(&s.rest) && guard
         })?;
         ascending("skinned vertex", &self.skins, |s| s.vertex)?;
         all("mode", &self.modes, |m| {
@@ -449,6 +498,7 @@ impl Upsampler {
         self.operator.resident_bytes()
             + modes
             + size_of_val(&p.skins[..])
+            + size_of_val(&p.tethers[..])
             + size_of_val(&p.places[..])
             + size_of_val(&p.points[..])
             + size_of_val(&p.triangles[..])
@@ -460,9 +510,16 @@ impl Upsampler {
     }
 }
 
+/// A unit vector or none, and a height that is a number.
+fn is_guard(normal: &[f32; 3], floor_m: f32) -> bool {
+    let square: f32 = normal.iter().map(|x| x * x).sum();
+    (square.to_bits() == 0 || (0.98..=1.02).contains(&square)) && floor_m.abs() <= FAR_M
+}
+
 fn joints_named(parts: &Parts) -> usize {
     let pins = parts.pins.iter().map(|pin| &pin.binding);
-    let bound = pins.chain(parts.skins.iter().map(|skin| &skin.binding)).flat_map(|b| b.joints);
+    let bound = pins.chain(parts.skins.iter().map(|skin| &skin.binding));
+    let bound = bound.chain(parts.tethers.iter().map(|t| &t.binding)).flat_map(|b| b.joints);
     let carried = parts.capsules.iter().map(|c| c.joint);
     let carried = carried.chain(parts.classes.iter().map(|c| c.joint));
     bound.chain(carried).map(|joint| usize::from(joint) + 1).max().unwrap_or(0)

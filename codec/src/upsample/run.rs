@@ -1,6 +1,6 @@
 //! Applying an upsampler, once a frame.
 
-use super::{Binding, Mode, Transform, UpsampleError, Upsampler, WHOLE};
+use super::{Binding, Held, Mode, Transform, UpsampleError, Upsampler, WHOLE};
 use crate::kernel::Set;
 use crate::kernel::normals::Faces;
 
@@ -104,6 +104,15 @@ impl Upsampler {
         out.extend(self.parts.pins.iter().map(|pin| skinned(&pin.binding, joints, point(pin))));
     }
 
+    /// Where the tethers are, in order.
+    pub fn tethers(&self, joints: &[Transform], out: &mut Vec<Held>) {
+        out.clear();
+        out.extend(self.parts.tethers.iter().map(|t| Held {
+            at: skinned(&t.binding, joints, self.parts.points[usize::from(t.point)]),
+            normal: turned(&t.binding, joints, t.normal),
+        }));
+    }
+
     /// Coarse positions of a fine cloth (m), both three numbers a point.
     ///
     /// # Errors
@@ -128,7 +137,8 @@ impl Upsampler {
         Ok(())
     }
 
-    /// Where the garment follows the body it goes over into skinning (Kavan et al. 2011, section 6).
+    /// Where the garment follows the body it goes over into skinning (Kavan et al. 2011, section 6), and
+    /// where it lies on the body it does not get into it.
     fn hand_over(&self, joints: &[Transform], positions: &mut [f32]) {
         let (points, _) = positions.as_chunks_mut::<3>();
         for skin in &self.parts.skins {
@@ -136,6 +146,13 @@ impl Upsampler {
             let share = f32::from(skin.share) / f32::from(WHOLE);
             for (x, at) in points[skin.vertex as usize].iter_mut().zip(at) {
                 *x += share * (at - *x);
+            }
+            if skin.is_guarded() {
+                let normal = turned(&skin.binding, joints, skin.normal);
+                let x = &mut points[skin.vertex as usize];
+                let height: f32 = (0..3).map(|a| normal[a] * (x[a] - at[a])).sum();
+                let lift = (skin.floor_m - height).max(0.0);
+                x.iter_mut().zip(normal).for_each(|(x, n)| *x += lift * n);
             }
         }
     }
@@ -170,4 +187,19 @@ fn skinned(binding: &Binding, joints: &[Transform], p: [f32; 3]) -> [f32; 3] {
         }
     }
     sum
+}
+
+/// A unit vector of the rest pose, carried along; zero where the joints turn it away in equal parts.
+fn turned(binding: &Binding, joints: &[Transform], n: [f32; 3]) -> [f32; 3] {
+    let mut sum = [0.0f32; 3];
+    for (joint, share) in binding.joints.iter().zip(binding.shares) {
+        if share > 0 {
+            let weight = f32::from(share) / f32::from(WHOLE);
+            for (sum, [x, y, z, _]) in sum.iter_mut().zip(&joints[usize::from(*joint)]) {
+                *sum += weight * (x * n[0] + y * n[1] + z * n[2]);
+            }
+        }
+    }
+    let length = sum.iter().map(|x| x * x).sum::<f32>().sqrt();
+    if length > 1e-6 { sum.map(|x| x / length) } else { [0.0; 3] }
 }

@@ -84,16 +84,23 @@ impl Frames {
         Self { coarse, fine, points: self.points, middles }
     }
 
-    /// These frames, then the same with each row in another's place.
+    /// Each frame, and after it the same with each row in another's place: so a part of the time holds
+    /// both.
     pub fn with_rows_of(&self, coarse: &[usize], fine: &[usize]) -> Self {
-        let columns = self.fine.ncols();
-        let turned = Self {
-            coarse: Mat::from_fn(coarse.len(), columns, |i, c| self.coarse[(coarse[i], c)]),
-            fine: Mat::from_fn(fine.len(), columns, |i, c| self.fine[(fine[i], c)]),
-            points: self.points,
-            middles: self.middles.clone(),
+        let columns = 2 * self.fine.ncols();
+        // Of three columns and their three twins: which column it is, and whether of a twin.
+        let from = |c: usize| (3 * (c / 6) + c % 3, c % 6 >= 3);
+        let row = |twins: &[usize], i: usize, turned: bool| if turned { twins[i] } else { i };
+        let at = |list: &[usize], i: usize, c: usize| {
+            let (column, turned) = from(c);
+            (row(list, i, turned), column)
         };
-        self.and(&turned)
+        Self {
+            coarse: Mat::from_fn(coarse.len(), columns, |i, c| self.coarse[at(coarse, i, c)]),
+            fine: Mat::from_fn(fine.len(), columns, |i, c| self.fine[at(fine, i, c)]),
+            points: self.points,
+            middles: (0..columns).map(|c| self.middles[from(c).0]).collect(),
+        }
     }
 
     /// The same frames with what `operator` (N x M) makes of the coarse points taken away.

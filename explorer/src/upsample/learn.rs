@@ -7,7 +7,7 @@ use super::beyond;
 use super::cache::Cache;
 use super::cached_harmonics;
 use super::data::Frames;
-use super::fit::{FitError, Profile, Training};
+use super::fit::{FitError, Training};
 use super::harmonics::{Harmonics, HarmonicsError, Laplacian, harmonics};
 use super::mirror::Mirror;
 use super::modes::{Mode, along_normals, modes};
@@ -78,14 +78,15 @@ pub struct Lesson {
 pub struct Learned {
     /// Coarse mesh with its pins, cloth and liberties; fine mesh.
     pub scene: Scene,
-    /// The operator, row-major N x M: a smooth correction of the barycentric lift.
+    /// The operator, row-major N x M: rows of compact support, pulled to the barycentric lift.
     pub weights: Vec<f32>,
     /// Pairs of oscillatory modes along the normals.
     pub modes: Vec<Mode>,
-    /// Harmonics used.
-    pub k: usize,
-    /// Profile, tuned on the training motion.
-    pub profile: Profile,
+    /// How hard it is pulled, tuned on the training motion.
+    pub gamma: f64,
+    /// Whether it was learnt from mirrored frames as well: where the cloth has a mirror, and that does
+    /// better on the end of the training motion.
+    pub mirrored: bool,
 }
 
 /// Simulates a scene's training motion (or finds it in `cache`) and learns from it. `progress` is told
@@ -101,11 +102,22 @@ pub fn learn(
     let lesson = Lesson::new(name, 1, HARMONICS, Tests::Harmonic, cache, progress)?;
     let frames = lesson.training();
     let prior = lesson.barycentric();
-    let profile = lesson.table(&frames.without(prior.as_ref()))?.profile();
-    let (harmonics, k) = (&lesson.harmonics, lesson.k);
-    let operator = beyond::corrected(frames, prior.as_ref(), harmonics, k, &profile)?;
+    let (mut gamma, plain) = lesson.tune_sparse(prior.as_ref(), None)?;
+    let mirror = Mirror::of(&lesson.scene);
+    let with =
+        mirror.map(|m| Ok::<_, FitError>((lesson.tune_sparse(prior.as_ref(), Some(&m))?, m)));
+    let chosen = with.transpose()?.filter(|((_, held_out), _)| *held_out < plain);
+    let mirrored = chosen.is_some();
+    let known = match chosen {
+        Some(((better, _), mirror)) => {
+            gamma = better;
+            &mirror.both(frames)
+        }
+        None => frames,
+    };
+    let operator = beyond::sparse(known, prior.as_ref(), &lesson.supports(), gamma)?;
     let modes = lesson.modes(&operator);
-    Ok(Learned { weights: rows(operator.as_ref()), modes, k, profile, scene: lesson.scene })
+    Ok(Learned { weights: rows(operator.as_ref()), modes, gamma, mirrored, scene: lesson.scene })
 }
 
 impl Lesson {

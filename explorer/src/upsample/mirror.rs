@@ -29,7 +29,7 @@ impl Mirror {
         Some(Self { coarse: twins(&scene.coarse)?, fine: twins(&scene.fine)? })
     }
 
-    /// Frames, then their twins.
+    /// Frames, each followed by its twin.
     pub fn both(&self, frames: &Frames) -> Frames {
         frames.with_rows_of(&self.coarse, &self.fine)
     }
@@ -80,5 +80,9 @@ mod tests {
         assert_eq!((both.count(), both.middles.len()), (2, 6));
         assert_eq!((both.coarse[(0, 4)], both.coarse[(1, 4)]), (11.0, 1.0));
         assert_eq!((both.fine[(0, 5)], both.fine[(1, 5)], both.fine[(2, 5)]), (22.0, 12.0, 2.0));
+        let again = mirror.both(&both);
+        assert_eq!(again.count(), 4);
+        assert_eq!((again.coarse[(0, 1)], again.coarse[(0, 10)]), (1.0, 1.0), "twins of twins");
+        assert_eq!((again.coarse[(0, 3)], again.coarse[(0, 6)]), (10.0, 10.0));
     }
 }

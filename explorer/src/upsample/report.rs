@@ -79,6 +79,8 @@ pub struct Parameters {
     pub harmonic_lift: [f64; 3],
     /// gamma of the sparse operator.
     pub sparse: f64,
+    /// gamma_1, gamma_N and c of the one that learns from mirrored frames as well, tuned with them.
+    pub harmonic_mirrored: Option<[f64; 3]>,
     /// gamma of the one that learns from mirrored frames as well; `None` where the cloth has no mirror.
     pub sparse_mirrored: Option<f64>,
     /// Whether that one does better on the end of the training motion, which neither has learnt from.
@@ -153,6 +155,7 @@ struct Mirrored {
     harmonic: Mat<f32>,
     sparse: Mat<f32>,
     gamma: f64,
+    profile: Profile,
     /// Sum of squares of the sparse one on the end of the training motion (m^2).
     held_out: f64,
 }
@@ -210,13 +213,16 @@ impl Lesson {
         let blend =
             Blend::learn(frames, &self.scene.coarse.mesh, both, (harmonics, k), &lift_profile)?;
         let modes = self.modes(&harmonic);
-        let mirrored = self.mirrored(prior.as_ref(), &profile)?;
+        let mirrored = self.mirrored(prior.as_ref())?;
         let parameters = Parameters {
             tikhonov: alpha,
             laplacian: stiff,
             harmonic: [profile.first, profile.last, profile.exponent],
             harmonic_lift: [lift_profile.first, lift_profile.last, lift_profile.exponent],
             sparse: gamma,
+            harmonic_mirrored: mirrored
+                .as_ref()
+                .map(|m| [m.profile.first, m.profile.last, m.profile.exponent]),
             sparse_mirrored: mirrored.as_ref().map(|m| m.gamma),
             mirror_chosen: mirrored.as_ref().is_some_and(|m| m.held_out < plain),
         };
@@ -241,17 +247,14 @@ impl Lesson {
     }
 
     /// Operators that learn from mirrored frames as well, where the cloth has a mirror.
-    fn mirrored(
-        &self,
-        prior: MatRef<'_, f32>,
-        profile: &Profile,
-    ) -> Result<Option<Mirrored>, LearnError> {
+    fn mirrored(&self, prior: MatRef<'_, f32>) -> Result<Option<Mirrored>, LearnError> {
         let Some(mirror) = Mirror::of(&self.scene) else { return Ok(None) };
         let (gamma, held_out) = self.tune_sparse(prior, Some(&mirror))?;
         let both = mirror.both(self.training());
         let sparse = beyond::sparse(&both, prior, &self.supports(), gamma)?;
-        let harmonic = Training::new(&both, &self.harmonics, self.k)?.harmonic(profile);
-        Ok(Some(Mirrored { harmonic, sparse, gamma, held_out }))
+        let profile = self.table(&both)?.profile();
+        let harmonic = Training::new(&both, &self.harmonics, self.k)?.harmonic(&profile);
+        Ok(Some(Mirrored { harmonic, sparse, gamma, profile, held_out }))
     }
 
     /// The whole report.

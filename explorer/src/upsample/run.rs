@@ -145,6 +145,7 @@ impl<'a> Simulation<'a> {
                 colliders: &colliders,
                 wind: now.wind,
                 push: &[],
+                tethers: &[],
                 seconds: self.scene.frame_s,
             };
             let start = Instant::now();

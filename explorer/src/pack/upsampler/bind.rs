@@ -9,6 +9,14 @@ use crate::scene::Scene;
 /// A vertex that skinning predicts to within this (m, root mean square over the states) is left to it;
 /// one that is off by the second is not at all.
 const FOLLOWS_M: [f32; 2] = [0.01, 0.03];
+/// Of its distances from where the skin leads it, a tether leaves room for this share of the states', and
+/// some more (m): with room for all of them the robe's sleeves slid up the arms.
+const REACHED: (f32, f32) = (0.5, 0.03);
+/// A point that strays further than this (m) hangs freely.
+const FREE_M: f32 = 0.4;
+/// A floor lies where this share of the states is below it, but this far outside the skin (m) at least.
+const LOW: f32 = 0.05;
+const OUTSIDE_M: f32 = 0.004;
 /// Rounds of smoothing over the mesh, so that the hand-over is gradual.
 const ROUNDS: usize = 6;
 
@@ -18,12 +26,25 @@ pub(super) struct Bound {
     pub(super) shares: Vec<f32>,
     /// By which joints.
     pub(super) bindings: Vec<Binding>,
+    /// What the skin leaves each of them.
+    pub(super) rooms: Vec<Room>,
+}
+
+/// How far a vertex strays from where the skin leads it, and how it stays outside the body.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Room {
+    /// (m); infinite where it hangs freely.
+    pub(super) reach_m: f32,
+    /// Out of the body, in the rest pose.
+    pub(super) normal: Vec3,
+    /// Along it from where the skin leads the vertex (m).
+    pub(super) floor_m: f32,
 }
 
 /// Binds a garment to its scene's body, as its states tell.
 pub(super) fn bind(scene: &Scene, states: &[(PoseId, Vec<f32>)]) -> Bound {
     let (body, garment) = (&scene.body, &scene.garment);
-    let bindings = bindings(body, &garment.positions);
+    let (bindings, outward) = bindings(body, &garment.positions);
     let mut squares = vec![0.0f64; garment.positions.len()];
     for (pose, positions) in states {
         let joints = transforms(body, &scene.primary.poses()[pose.index()].pose);
@@ -50,7 +71,42 @@ pub(super) fn bind(scene: &Scene, states: &[(PoseId, Vec<f32>)]) -> Bound {
         shares = smoothed(&shares, &garment.triangles);
         attached(&mut shares);
     }
-    Bound { shares, bindings }
+    let rooms = rooms(scene, states, &bindings, &outward);
+    Bound { shares, bindings, rooms }
+}
+
+/// What the states' distances from the skin tell.
+fn rooms(
+    scene: &Scene,
+    states: &[(PoseId, Vec<f32>)],
+    bindings: &[Binding],
+    outward: &[(Vec3, f32)],
+) -> Vec<Room> {
+    let joints: Vec<Vec<Transform>> = states
+        .iter()
+        .map(|(pose, _)| transforms(&scene.body, &scene.primary.poses()[pose.index()].pose))
+        .collect();
+    let (mut far, mut high) = (Vec::new(), Vec::new());
+    let one = |(v, (binding, (normal, height))): (usize, (&Binding, &(Vec3, f32)))| {
+        far.clear();
+        high.clear();
+        for (joints, (_, positions)) in joints.iter().zip(states) {
+            let off = Vec3::from_slice(&positions[3 * v..][..3])
+                - skinned(binding, joints, scene.garment.positions[v]);
+            far.push(off.length());
+            high.push(turned(binding, joints, *normal).dot(off));
+        }
+        far.sort_by(f32::total_cmp);
+        high.sort_by(f32::total_cmp);
+        let at = |list: &[f32], share: f32| {
+            list.get((list.len() as f32 * share) as usize).copied().unwrap_or(f32::INFINITY)
+        };
+        let reach_m = at(&far, REACHED.0) + REACHED.1;
+        let reach_m = if reach_m <= FREE_M { reach_m } else { f32::INFINITY };
+        let floor_m = at(&high, LOW).max(OUTSIDE_M - height);
+        Room { reach_m, normal: *normal, floor_m }
+    };
+    bindings.iter().zip(outward).enumerate().map(one).collect()
 }
 
 /// Mean over each vertex and its neighbours.
@@ -68,12 +124,13 @@ fn smoothed(shares: &[f32], triangles: &[[u32; 3]]) -> Vec<f32> {
 }
 
 /// Each vertex by the joints of the closest place on the body in the rest pose.
-fn bindings(body: &Body, positions: &[Vec3]) -> Vec<Binding> {
+/// Also the direction out of the body there, and how far out the vertex lies (m).
+fn bindings(body: &Body, positions: &[Vec3]) -> (Vec<Binding>, Vec<(Vec3, f32)>) {
     let surface = Surface::new(&body.rest_positions, &body.triangles);
     let posed = surface.posed(&body.rest_positions);
     let one = |p: &Vec3| {
         let Some(contact) = surface.closest(&posed, *p, f32::INFINITY) else {
-            return Binding::of(0);
+            return (Binding::of(0), (Vec3::ZERO, 0.0));
         };
         let mut weights: Vec<(f32, u16)> = Vec::new();
         let corners = body.triangles[contact.triangle as usize];
@@ -90,9 +147,11 @@ fn bindings(body: &Body, positions: &[Vec3]) -> Vec<Binding> {
         weights.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         weights.resize(4, (0.0, 0));
         let place = |i: usize| weights[i];
-        Binding::new([0, 1, 2, 3].map(|i| place(i).1), [0, 1, 2, 3].map(|i| place(i).0))
+        let binding =
+            Binding::new([0, 1, 2, 3].map(|i| place(i).1), [0, 1, 2, 3].map(|i| place(i).0));
+        (binding, (contact.normal, contact.distance))
     };
-    positions.iter().map(one).collect()
+    positions.iter().map(one).unzip()
 }
 
 /// For each joint what moves a point of the rest pose into the pose's state frame.
@@ -117,4 +176,15 @@ fn skinned(binding: &Binding, joints: &[Transform], p: Vec3) -> Vec3 {
         sum += Vec3::from_array(joints[usize::from(*joint)].map(row)) * weight;
     }
     sum
+}
+
+/// A unit vector of the rest pose, carried along.
+fn turned(binding: &Binding, joints: &[Transform], n: Vec3) -> Vec3 {
+    let mut sum = Vec3::ZERO;
+    for (joint, share) in binding.joints.iter().zip(binding.shares) {
+        let weight = f32::from(share) / f32::from(codec::upsample::WHOLE);
+        let row = |[x, y, z, _]: [f32; 4]| x * n.x + y * n.y + z * n.z;
+        sum += Vec3::from_array(joints[usize::from(*joint)].map(row)) * weight;
+    }
+    sum.normalize_or_zero()
 }

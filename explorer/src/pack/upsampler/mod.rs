@@ -7,21 +7,19 @@
 //! to skinning (`bind`; Kavan et al. 2011, section 6).
 
 mod bind;
+mod capsules;
 mod coarsen;
 mod fit;
 
-use std::collections::BTreeMap;
-
-use cloth::{Body, Mesh, MeshError, Vec3};
+use cloth::{Mesh, MeshError, Vec3};
 use codec::kernel::operator::OperatorError;
 use codec::upsample::{
-    Capsule, Class, Fabric, Parts, Pin, Place, Skin, Stepping, UpsampleError, Upsampler, WHOLE,
+    Class, Fabric, Parts, Pin, Place, Skin, Stepping, Tether, UpsampleError, Upsampler, WHOLE,
     Weights,
 };
 use protocol::links::LinkEntry;
 use protocol::{PoseId, StateId};
 
-use super::scene_chunk::scene_chunk;
 use crate::scene::Scene;
 use crate::view::GraphView;
 
@@ -141,7 +139,8 @@ pub fn learn(
         triangles: coarse.triangles.iter().map(|t| t.map(|v| v as u16)).collect(),
         places: coarse.vertices.iter().map(|v| place(*v)).collect(),
         pins: pins.collect(),
-        capsules: capsules(scene, &data, &coarse.vertices, &bound),
+        tethers: tethers(&coarse.vertices, &bound),
+        capsules: capsules::capsules(&scene.body),
         fabric: fabric(scene, &mesh),
         stepping: stepping(scene),
         skins: skins(scene, &bound),
@@ -223,8 +222,32 @@ fn skins(scene: &Scene, bound: &bind::Bound) -> Vec<Skin> {
         share: (bound.shares[v] * f32::from(WHOLE)).round() as u16,
         binding: bound.bindings[v],
         rest: scene.garment.positions[v].to_array(),
+        normal: guard(&bound.rooms[v]).map_or([0.0; 3], |room| room.normal.to_array()),
+        floor_m: guard(&bound.rooms[v]).map_or(0.0, |room| room.floor_m),
     };
-    (0..bound.shares.len()).map(skin).filter(|skin| skin.share > 0).collect()
+    let touches = |skin: &Skin| skin.share > 0 || skin.is_guarded();
+    (0..bound.shares.len()).map(skin).filter(touches).collect()
+}
+
+/// What keeps a vertex off the body, where it is near enough for a plane to tell.
+fn guard(room: &bind::Room) -> Option<&bind::Room> {
+    (room.reach_m.is_finite() && room.normal != Vec3::ZERO).then_some(room)
+}
+
+/// Free coarse points that the skin leaves some room only.
+fn tethers(vertices: &[u32], bound: &bind::Bound) -> Vec<Tether> {
+    let tether = |(point, v): (usize, &u32)| {
+        let (v, room) = (*v as usize, &bound.rooms[*v as usize]);
+        let held = bound.shares[v] <= PINNED_SHARE && room.reach_m.is_finite();
+        held.then(|| Tether {
+            point: point as u16,
+            binding: bound.bindings[v],
+            reach_m: room.reach_m,
+            normal: room.normal.to_array(),
+            floor_m: room.floor_m,
+        })
+    };
+    vertices.iter().enumerate().filter_map(tether).collect()
 }
 
 /// The garment's own, but for bending: a fold that the coarse mesh cannot resolve must not form, so that
@@ -247,17 +270,19 @@ fn fabric(scene: &Scene, mesh: &Mesh) -> Fabric {
     }
 }
 
-/// Two steps a frame; coarse triangles may shrink where the fine cloth folds.
+/// Two steps a frame; coarse triangles may shrink where the fine cloth folds. Capsules are wider by what
+/// triangles between points cut off (Kavan et al. 2011, section 7).
 fn stepping(scene: &Scene) -> Stepping {
     Stepping {
         steps: 2,
-        passes: 20,
+        passes: 10,
         sweeps: 4,
         ground: scene.exploration.ground,
-        compression: 0.3,
+        compression: 0.6,
         damping_per_s: 1.0,
-        expansion_m: 0.005,
-        spacing_m: 0.05,
+        expansion_m: 0.015,
+        spacing_m: 0.08,
+        apart_m: 0.04,
     }
 }
 
@@ -269,51 +294,6 @@ fn classes(scene: &Scene) -> Vec<Class> {
         vertices: rule.vertices.clone(),
     };
     scene.metric.classes.iter().map(class).collect()
-}
-
-/// The scene's capsules, each no thicker than the cloth of the states allows: coarse points that were
-/// simulated on the skin itself are not pushed off it by a stouter stand-in.
-fn capsules(scene: &Scene, data: &Data, vertices: &[u32], bound: &bind::Bound) -> Vec<Capsule> {
-    let body: &Body = &scene.body;
-    let free: Vec<u32> =
-        vertices.iter().copied().filter(|v| bound.shares[*v as usize] <= PINNED_SHARE).collect();
-    let mut nearest: BTreeMap<usize, Vec<f32>> = BTreeMap::new();
-    let chunk = scene_chunk(scene);
-    let offset = scene.garment.fabric.offset;
-    for (pose, positions) in &data.states {
-        let pose = &scene.primary.poses()[pose.index()].pose;
-        let mut world = Vec::new();
-        body.skeleton.world(pose, &mut world);
-        let hips = pose.hips();
-        for (index, capsule) in chunk.colliders.iter().enumerate() {
-            let joint = &world[usize::from(capsule.joint)];
-            let [a, b] = [capsule.a, capsule.b].map(|end| joint.point(Vec3::from_array(end)));
-            let distances = free.iter().map(|v| {
-                let at = hips.point(Vec3::from_slice(&positions[3 * *v as usize..][..3]));
-                to_segment(at, a, b)
-            });
-            let least = distances.fold(f32::INFINITY, f32::min);
-            nearest.entry(index).or_default().push(least);
-        }
-    }
-    let capsule = |(index, c): (usize, &protocol::scene::Capsule)| {
-        let mut distances = nearest.remove(&index).unwrap_or_default();
-        distances.sort_by(f32::total_cmp);
-        // In nineteen of twenty states nothing lies inside.
-        let room = distances.get(distances.len() / 20).map_or(c.radius, |d| d - offset);
-        Capsule { joint: c.joint, ends: [c.a, c.b], radius: c.radius.min(room).max(0.0) }
-    };
-    let mut capsules: Vec<Capsule> = chunk.colliders.iter().enumerate().map(capsule).collect();
-    capsules.retain(|capsule| capsule.radius > 0.005);
-    capsules.truncate(codec::upsample::CAPSULES_MAX);
-    capsules
-}
-
-fn to_segment(p: Vec3, a: Vec3, b: Vec3) -> f32 {
-    let way = b - a;
-    let length2 = way.length_squared();
-    let t = if length2 > 0.0 { ((p - a).dot(way) / length2).clamp(0.0, 1.0) } else { 0.0 };
-    p.distance(a + way * t)
 }
 
 #[cfg(test)]
