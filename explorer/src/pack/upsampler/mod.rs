@@ -32,6 +32,10 @@ const BITS: u8 = 8;
 /// A coarse point that follows the skin by more than this is led by it.
 const PINNED_SHARE: f32 = 0.5;
 
+/// A fine vertex that strays further from where the skin leads it is not kept off the body (m): coarse
+/// points are, and a plane further away would lift it off the states as well.
+const GUARDED_M: f32 = 0.1;
+
 /// How an upsampler is made.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UpsamplerSettings {
@@ -229,9 +233,9 @@ fn skins(scene: &Scene, bound: &bind::Bound) -> Vec<Skin> {
     (0..bound.shares.len()).map(skin).filter(touches).collect()
 }
 
-/// What keeps a vertex off the body, where it is near enough for a plane to tell.
+/// What keeps a fine vertex off the body, where it is near enough for a plane to tell.
 fn guard(room: &bind::Room) -> Option<&bind::Room> {
-    (room.reach_m.is_finite() && room.normal != Vec3::ZERO).then_some(room)
+    (room.reach_m <= GUARDED_M && room.normal != Vec3::ZERO).then_some(room)
 }
 
 /// Free coarse points that the skin leaves some room only.
