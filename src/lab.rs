@@ -87,8 +87,8 @@ struct Summary<'a> {
     cpu_ms_per_frame: f64,
     stretch_p99_pct: f64,
     stretch_max_pct: f64,
-    penetration_mm: f64,
-    self_hits: u64,
+    penetration_mm: Option<f64>,
+    self_hits: Option<u64>,
     lowest_m: f64,
     speed_max_m_s: f64,
     pass: bool,
@@ -123,7 +123,7 @@ impl<'a> Summary<'a> {
             cpu_ms_per_frame: t.cpu_ms_per_frame(),
             stretch_p99_pct: 100.0 * f64::from(t.stretch_p99),
             stretch_max_pct: 100.0 * f64::from(t.stretch_max),
-            penetration_mm: format::mm(t.penetration_m),
+            penetration_mm: t.penetration_m.map(format::mm),
             self_hits: t.self_hits,
             lowest_m: if t.lowest_m.is_finite() { f64::from(t.lowest_m) } else { 0.0 },
             speed_max_m_s: f64::from(t.speed_max_m_s),
@@ -199,9 +199,9 @@ fn print(bench: &Bench, report: &Report) {
         100.0 * t.stretch_max
     );
     println!(
-        "  penetration {:.3} mm, self hits {}, lowest {:.4} m",
-        format::mm(t.penetration_m),
-        t.self_hits,
+        "  penetration {}, self hits {}, lowest {:.4} m",
+        t.penetration_m.map_or("-".into(), |m| format!("{:.3} mm", format::mm(m))),
+        t.self_hits.map_or("-".into(), |hits| hits.to_string()),
         t.lowest_m
     );
 }

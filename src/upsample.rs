@@ -80,8 +80,8 @@ pub struct FitArgs {
 }
 
 fn profile(text: &str) -> Result<Profile, String> {
-    let numbers: Vec<f64> = text.split(',').filter_map(|n| n.trim().parse().ok()).collect();
-    match numbers[..] {
+    let numbers: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse()).collect();
+    match numbers.unwrap_or_default()[..] {
         [first, last, exponent]
             if first > 0.0 && last >= first && (0.0..=64.0).contains(&exponent) =>
         {
@@ -336,7 +336,9 @@ mod tests {
     fn profiles_are_three_numbers_that_rise() {
         let found = profile("1, 1e5,4").unwrap();
         assert_eq!(found, Profile { first: 1.0, last: 1e5, exponent: 4.0 });
-        for wrong in ["", "1,2", "0,1,4", "2,1,4", "1,inf,4", "1,2,-1", "1,2,x", "1,2,3,4"] {
+        for wrong in
+            ["", "1,2", "0,1,4", "2,1,4", "1,inf,4", "1,2,-1", "1,2,x", "1,x,1e5,4", "1,2,3,4"]
+        {
             assert!(profile(wrong).is_err(), "{wrong}");
         }
     }

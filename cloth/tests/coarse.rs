@@ -259,6 +259,16 @@ fn a_teleport_takes_the_cloth_along() {
     assert!(seconds < REST_S && flag.stretch() < REST_STRETCH, "{seconds} {}", flag.stretch());
 }
 
+#[test]
+fn pins_torn_apart_leave_numbers() {
+    let mut flag = Flag::new(14, Material::default());
+    for (i, pin) in flag.pins.iter_mut().enumerate() {
+        pin.x += 10.0 * i as f32;
+    }
+    (0..30).for_each(|_| flag.step(DT, Vec3::ZERO, &[]));
+    assert!(flag.extent() < 200.0, "{}", flag.extent());
+}
+
 /// Random wind, shaking, balls, lengths of step and teleports; bounded at every step.
 fn unattended(n: u32, steps: u32) {
     let mut rng = Pcg64Mcg::new(5);

@@ -56,6 +56,18 @@ fn check(name: &str, quick: bool) {
     }
 }
 
+/// Where in a substep a rod meets cloth is chance, and so is where its triangles lie.
+#[test]
+fn a_rod_sweeps_sheets_of_any_fineness() {
+    for n in [18, 22, 35] {
+        let settings = Settings { quick: true, n: Some(n), ..Settings::default() };
+        let report = find("C2").unwrap().run(settings, &mut || 0.0, &mut |_| true).unwrap();
+        for row in report.rows.iter().filter(|row| row.what.ends_with("passed")) {
+            assert!(row.passes(), "{n} vertices a side, {}: {}", row.what, row.figure);
+        }
+    }
+}
+
 macro_rules! benches {
     ($($test:ident $name:literal)*) => {
         $(#[test]

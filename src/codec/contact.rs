@@ -112,7 +112,7 @@ pub(crate) fn run(a: &args::CodecContact) -> Result<()> {
         );
     }
     println!(
-        "{merges} merges      acceleration p50, p99 (m/s^2)   jump rms   in the body   > 2 mm"
+        "{merges} merges      acceleration p50, p99 (m/s^2)   jump p50, p99 (m/s^2)  in the body   > 2 mm"
     );
     for b in &outcome.blends {
         println!(

@@ -467,8 +467,12 @@ impl Coarse {
             let weight =
                 |i: usize| if self.places[i] == usize::MAX { 0.0 } else { 1.0 / self.masses[i] };
             let (wa, wb) = (weight(a), weight(b));
+            // Between two pins nothing gives, however far apart they are led.
+            if wa + wb <= 0.0 {
+                continue;
+            }
             let length = length2.sqrt();
-            let correction = d * ((length - most) / (length * (wa + wb).max(f32::MIN_POSITIVE)));
+            let correction = d * ((length - most) / (length * (wa + wb)));
             ws.x[a] += correction * wa;
             ws.x[b] -= correction * wb;
         }

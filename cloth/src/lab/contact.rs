@@ -62,16 +62,6 @@ pub(crate) const C6: Bench = Bench {
 };
 
 const FRAME_S: f32 = 1.0 / 30.0;
-/// What counts as inside: a tenth of the distance that cloth keeps (m).
-const INSIDE_M: f32 = 4e-4;
-
-/// Deepest vertex that is not held between two parts of the body (m).
-fn depth(sim: &Sim) -> f32 {
-    let Some(surface) = sim.model.surface() else { return 0.0 };
-    let posed = surface.posed(sim.body());
-    let offset = sim.model.material().offset;
-    measure::penetration(surface, &posed, &sim.state.positions, INSIDE_M, offset).depth_max_m
-}
 
 fn fastest(sim: &Sim) -> f32 {
     sim.state.velocities.iter().map(|v| v.length_squared()).fold(0.0, f32::max).sqrt()
@@ -101,41 +91,46 @@ fn on_shapes(stage: &mut Stage<'_>) -> Result<(), LabError> {
         let mut deepest = 0.0f32;
         for _ in 0..frames {
             stage.step(&mut sim, Some((&pose, &pose)))?;
-            deepest = deepest.max(depth(&sim));
+            deepest = deepest.max(sim.depth_m);
         }
         let what = format!("{name}: deepest vertex");
         stage.row(what, f64::from(deepest) * 1e3, "mm", "0", Limit::AtMost(0.4));
         let end = f64::from(fastest(&sim));
         stage.row(format!("{name}: speed at the end"), end, "m/s", "rest", Limit::AtMost(0.05));
-        stage.tally.penetration_m = stage.tally.penetration_m.max(deepest);
     }
-    stage.row("crossings", stage.tally.self_hits as f64, "", "0", Limit::AtMost(0.0));
+    stage.row("crossings", stage.hits as f64, "", "0", Limit::AtMost(0.0));
     Ok(())
 }
 
 fn swept(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let n = stage.side(31);
-    let start = Vec3::new(0.0, 0.45, -0.2);
+    let start = Vec3::new(0.0, 0.45, 0.0);
     let body = ellipsoids(&[(start, Vec3::new(0.7, 0.04, 0.04))], 24);
     let calm = Environment { gravity: Vec3::ZERO, ..Environment::default() };
     for speed in [1.0f32, 2.0, 5.0, 10.0, 20.0] {
-        let mesh = sheet(n - 1, n - 1, Cut::Alternating, |u, v| Vec3::new(u - 0.5, 1.0 - v, 0.0))?;
-        let material = stage.material(Material::default());
-        let model = Model::new(mesh, material, calm, Some(body.clone()), &[])?;
-        let mut sim = stage.sim(model, FRAME_S);
-        sim.hits_every = 1;
-        let pose = |f: u32| pose_at(&body, start + Vec3::Z * (speed * f as f32 / 30.0));
-        let (mut passed, mut deep, mut strain) = (0, 0.0f32, 0.0f32);
-        // The sheet's vertices at the height of the rod.
-        let row = ((1.0 - start.y) * (n - 1) as f32).round() as u32;
-        for f in 0..10 {
-            stage.step(&mut sim, Some((&pose(f), &pose(f + 1))))?;
-            let rod = pose(f + 1).root.z;
-            let met = (row * n..(row + 1) * n).map(|v| sim.state.positions[v as usize]);
-            passed += met.filter(|p| rod > 0.0 && p.z < rod).count();
-            deep = deep.max(depth(&sim));
-            let mesh = sim.model.mesh();
-            strain = strain.max(measure::stretch_quantile(mesh, &sim.state.positions, 0.99));
+        let (mut passed, mut deep, mut strain, mut end) = (0, 0.0f32, 0.0f32, 0.0f32);
+        // Where in a substep the rod meets the sheet is chance: three beginnings.
+        for from_z in [-0.20, -0.17, -0.14] {
+            let mesh =
+                sheet(n - 1, n - 1, Cut::Alternating, |u, v| Vec3::new(u - 0.5, 1.0 - v, 0.0))?;
+            let material = stage.material(Material::default());
+            let model = Model::new(mesh, material, calm, Some(body.clone()), &[])?;
+            let mut sim = stage.sim(model, FRAME_S);
+            sim.hits_every = 1;
+            let pose =
+                |f: u32| pose_at(&body, start + Vec3::Z * (from_z + speed * f as f32 / 30.0));
+            // The sheet's vertices at the height of the rod.
+            let row = ((1.0 - start.y) * (n - 1) as f32).round() as u32;
+            for f in 0..10 {
+                stage.step(&mut sim, Some((&pose(f), &pose(f + 1))))?;
+                let rod = pose(f + 1).root.z;
+                let met = (row * n..(row + 1) * n).map(|v| sim.state.positions[v as usize]);
+                passed += met.filter(|p| rod > 0.0 && p.z < rod).count();
+                deep = deep.max(sim.depth_m);
+                let mesh = sim.model.mesh();
+                strain = strain.max(measure::stretch_quantile(mesh, &sim.state.positions, 0.99));
+            }
+            end = end.max(fastest(&sim));
         }
         let at = |what: &str| format!("{speed} m/s: {what}");
         let passed = passed as f64;
@@ -144,7 +139,7 @@ fn swept(stage: &mut Stage<'_>) -> Result<(), LabError> {
         stage.row(at("deepest vertex"), deep, "mm", "0", Limit::AtMost(4.0));
         let strain = f64::from(strain) * 100.0;
         stage.row(at("strain of 99 % of the edges"), strain, "%", "small", Limit::AtMost(10.0));
-        let times = f64::from(fastest(&sim) / speed);
+        let times = f64::from(end / speed);
         stage.row(at("fastest vertex at the end"), times, "x", "1", Limit::AtMost(2.0));
     }
     Ok(())
@@ -188,9 +183,9 @@ fn pinched(stage: &mut Stage<'_>) -> Result<(), LabError> {
     stage.row("fastest vertex against the ball", times, "x", "1", Limit::AtMost(2.0));
     let strain = f64::from(strain) * 100.0;
     stage.row("strain of 99 % of the edges", strain, "%", "small", Limit::AtMost(15.0));
-    let hits = stage.tally.self_hits as f64;
+    let hits = stage.hits as f64;
     stage.row("crossings 15 frames after", hits, "", "0", Limit::AtMost(0.0));
-    let deep = f64::from(depth(&sim)) * 1e3;
+    let deep = f64::from(sim.depth_m) * 1e3;
     stage.row("deepest vertex 15 frames after", deep, "mm", "0", Limit::AtMost(0.4));
     Ok(())
 }
@@ -261,12 +256,12 @@ fn cartwheel(stage: &mut Stage<'_>) -> Result<(), LabError> {
     };
     let (mut deep, mut frames, mut tangled, mut longest) = (0u32, 0u32, 0u32, 0u32);
     for f in 0..30 * (turns + 1) {
-        stage.tally.self_hits = 0;
+        stage.hits = 0;
         stage.step(&mut sim, Some((&pose(f), &pose(f + 1))))?;
-        tangled = if stage.tally.self_hits > 0 { tangled + 1 } else { 0 };
+        tangled = if stage.hits > 0 { tangled + 1 } else { 0 };
         longest = longest.max(tangled);
         frames += 1;
-        deep += u32::from(depth(&sim) > 5e-3);
+        deep += u32::from(sim.depth_m > 5e-3);
     }
     let share = f64::from(deep) / f64::from(frames) * 100.0;
     stage.row("frames with a vertex over 5 mm deep", share, "%", "0", Limit::AtMost(0.1));
@@ -277,9 +272,9 @@ fn cartwheel(stage: &mut Stage<'_>) -> Result<(), LabError> {
 
 fn against_itself(stage: &mut Stage<'_>) -> Result<(), LabError> {
     folded(stage)?;
-    let hits = stage.tally.self_hits as f64;
+    let hits = stage.hits as f64;
     stage.row("crossings, folded sheet", hits, "", "0", Limit::AtMost(0.0));
-    stage.tally.self_hits = 0;
+    stage.hits = 0;
     let ribbon = sheet(4, 80, Cut::Alternating, |u, v| {
         Vec3::new(0.06 * u, 0.05 + 1.2 * v, 0.02 * (9.0 * v).sin())
     })?;
@@ -289,15 +284,15 @@ fn against_itself(stage: &mut Stage<'_>) -> Result<(), LabError> {
     for _ in 0..if stage.settings.quick { 45 } else { 120 } {
         stage.step(&mut sim, None)?;
     }
-    let hits = stage.tally.self_hits as f64;
+    let hits = stage.hits as f64;
     stage.row("crossings, dropped ribbon", hits, "", "0", Limit::AtMost(0.0));
-    stage.tally.self_hits = 0;
+    stage.hits = 0;
     twisted(stage)?;
-    let hits = stage.tally.self_hits as f64;
+    let hits = stage.hits as f64;
     stage.row("crossings, twisted tube", hits, "", "0", Limit::AtMost(0.0));
-    stage.tally.self_hits = 0;
+    stage.hits = 0;
     tangled(stage)?;
-    let hits = stage.tally.self_hits as f64;
+    let hits = stage.hits as f64;
     stage.row("crossings left after 60 frames", hits, "", "0", Limit::AtMost(0.0));
     Ok(())
 }
@@ -402,7 +397,7 @@ fn layers(stage: &mut Stage<'_>) -> Result<(), LabError> {
         let (name, lost) = (if wrong { "started wrong" } else { "in order" }, disorder(&sim));
         let what = format!("{name}: rays on which the order is wrong at the end");
         stage.row(what, f64::from(lost), "", "0", Limit::AtMost(0.0));
-        let hits = stage.tally.self_hits as f64;
+        let hits = stage.hits as f64;
         stage.row(format!("{name}: crossings at the end"), hits, "", "0", Limit::AtMost(0.0));
     }
     Ok(())
@@ -417,7 +412,7 @@ fn walk(stage: &mut Stage<'_>, sim: &mut Sim, body: &Body) -> Result<(), LabErro
         pose
     };
     for f in 0..frames {
-        stage.tally.self_hits = 0;
+        stage.hits = 0;
         sim.hits_every = 1;
         stage.step(sim, Some((&pose(f), &pose(f + 1))))?;
     }

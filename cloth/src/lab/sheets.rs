@@ -133,7 +133,7 @@ fn on_ball(stage: &mut Stage<'_>) -> Result<(), LabError> {
         lowest.look(&sim);
         // The true ball, not its facets.
         let depth = sim.state.positions.iter().map(|p| BALL_M - p.length()).fold(0.0, f32::max);
-        stage.tally.penetration_m = stage.tally.penetration_m.max(depth);
+        stage.tally.penetration_m = Some(stage.tally.penetration_m.map_or(depth, |m| m.max(depth)));
     }
     // Heights count from the release, as the peers' do.
     stage.tally.lowest_m -= DROP_M + BALL_M;
@@ -141,8 +141,8 @@ fn on_ball(stage: &mut Stage<'_>) -> Result<(), LabError> {
     stage.tally.stretch_max = lowest.max;
     let t = stage.tally;
     let reference = "0";
-    stage.row("self hits", t.self_hits as f64, "", reference, Limit::AtMost(0.0));
-    let depth = 1e3 * f64::from(t.penetration_m);
+    stage.row("self hits", t.self_hits.unwrap_or(0) as f64, "", reference, Limit::AtMost(0.0));
+    let depth = 1e3 * f64::from(t.penetration_m.unwrap_or(0.0));
     stage.row("penetration", depth, "mm", reference, Limit::AtMost(0.0));
     let p99 = 100.0 * f64::from(t.stretch_p99);
     stage.row("p99 stretch where it is lowest", p99, "%", "about 1 %", Limit::AtMost(2.0));

@@ -84,10 +84,10 @@ pub struct Tally {
     pub stretch_p99: f32,
     /// Largest edge strain.
     pub stretch_max: f32,
-    /// Deepest vertex in the body (m).
-    pub penetration_m: f32,
-    /// Edges that cut a triangle: most in any frame looked at.
-    pub self_hits: u64,
+    /// Deepest vertex in the body in any frame (m); `None` without a body.
+    pub penetration_m: Option<f32>,
+    /// Edges that cut a triangle: most in any frame looked at; `None` where none was.
+    pub self_hits: Option<u64>,
     /// Lowest vertex of all frames (m).
     pub lowest_m: f32,
     /// Fastest vertex (m/s).
@@ -106,8 +106,8 @@ impl Default for Tally {
             iterations: 0,
             stretch_p99: 0.0,
             stretch_max: 0.0,
-            penetration_m: 0.0,
-            self_hits: 0,
+            penetration_m: None,
+            self_hits: None,
             lowest_m: f32::INFINITY,
             speed_max_m_s: 0.0,
         }
@@ -120,6 +120,9 @@ impl Tally {
         if self.timed_s > 0.0 { 1e3 * self.cpu_s / (60.0 * self.timed_s) } else { 0.0 }
     }
 }
+
+/// What counts as inside the body: a tenth of the distance that cloth keeps (m).
+const INSIDE_M: f32 = 4e-4;
 
 /// A cloth on the stage.
 pub struct Sim {
@@ -137,6 +140,8 @@ pub struct Sim {
     pub time_s: f32,
     /// Crossings are counted in every frame whose number is a multiple; 0: never.
     pub hits_every: u64,
+    /// Deepest vertex in the body after the last frame, those pinched between two parts apart (m).
+    pub depth_m: f32,
     frames: u64,
     run: u32,
     crossings: Crossings,
@@ -166,6 +171,8 @@ pub struct Stage<'a> {
     pub settings: Settings,
     /// What was measured so far; a bench may correct it.
     pub tally: Tally,
+    /// Most crossings in any frame looked at since the bench last took this.
+    pub hits: u64,
     clock: &'a mut dyn FnMut() -> f64,
     watch: &'a mut dyn FnMut(&Shot<'_>) -> bool,
     rows: Vec<Row>,
@@ -180,7 +187,7 @@ impl<'a> Stage<'a> {
         watch: &'a mut dyn FnMut(&Shot<'_>) -> bool,
     ) -> Self {
         let tally = Tally::default();
-        Self { settings, tally, clock, watch, rows: Vec::new(), runs: 0 }
+        Self { settings, tally, hits: 0, clock, watch, rows: Vec::new(), runs: 0 }
     }
 
     /// The figures and measures.
@@ -221,6 +228,7 @@ impl<'a> Stage<'a> {
             effort: Effort::default(),
             time_s: 0.0,
             hits_every: 0,
+            depth_m: 0.0,
             frames: 0,
             run: self.runs - 1,
             workspace: Workspace::default(),
@@ -269,8 +277,15 @@ impl<'a> Stage<'a> {
         let fastest = sim.state.velocities.iter().map(|v| v.length_squared()).fold(0.0, f32::max);
         t.speed_max_m_s = t.speed_max_m_s.max(fastest.sqrt());
         if sim.hits_every > 0 && sim.frames.is_multiple_of(sim.hits_every) {
-            let hits = sim.crossings.find(at).len();
-            t.self_hits = t.self_hits.max(hits as u64);
+            let hits = sim.crossings.find(at).len() as u64;
+            self.hits = self.hits.max(hits);
+            t.self_hits = t.self_hits.max(Some(hits));
+        }
+        if let Some(surface) = sim.model.surface() {
+            let posed = surface.posed(sim.body());
+            let offset = sim.model.material().offset;
+            sim.depth_m = measure::penetration(surface, &posed, at, INSIDE_M, offset).depth_max_m;
+            t.penetration_m = Some(t.penetration_m.map_or(sim.depth_m, |m| m.max(sim.depth_m)));
         }
     }
 

@@ -111,6 +111,10 @@ fn shorten(
             continue;
         }
         let (wa, wb) = (inverse_masses[a], inverse_masses[b]);
+        // Between two held vertices nothing gives.
+        if wa + wb <= 0.0 {
+            continue;
+        }
         let length = length2.sqrt();
         worst = worst.max(length / rest);
         let correction = d * ((length - most) / (length * (wa + wb)));

@@ -202,13 +202,15 @@ impl Workspace {
     }
 
     /// Poses the body at the beginning; returns the longest way of a point of its surface, less
-    /// the root's own shift (m).
+    /// the way on which the cloth is as a whole (m): what a character carries along costs nothing, and what runs
+    /// into cloth that hangs still is met in time.
     fn body_way(&mut self, model: &Model, span: &Span<'_>) -> f32 {
         let (Some(character), Some((from, to))) = (&model.body, span.motion) else { return 0.0 };
         character.body.skin(from, &mut self.joints, &mut self.from.positions);
         character.body.skin(to, &mut self.joints, &mut self.to.positions);
         character.surface.refit(&mut self.from);
-        let shift = to.root - from.root;
+        let mean = self.v.iter().sum::<Vec3A>() / self.v.len().max(1) as f32;
+        let shift = Vec3::from(mean * span.seconds);
         let ends = self.from.positions.iter().zip(&self.to.positions);
         ends.map(|(a, b)| (*b - *a - shift).length_squared()).fold(0.0, f32::max).sqrt()
     }

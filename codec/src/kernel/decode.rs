@@ -82,6 +82,7 @@ pub fn decode(
     if count == 0 || out.is_empty() {
         return;
     }
+    assert_eq!(out.len() % count, 0, "whole characters of {count} numbers");
     let call = Call { set, parts, mean, batch };
     let (mut coefficients, mut out) = (batch.coefficients, out);
     while !out.is_empty() {

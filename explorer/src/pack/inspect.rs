@@ -7,6 +7,7 @@ use protocol::region::{RegionChunk, RegionEntry};
 use protocol::scene::{GarmentChunk, SceneChunk};
 use protocol::{ChunkHash, DecodeError, LinkTable, NotTotal, PublisherKey, StateId, VersionNumber};
 
+use codec::upsample::{UpsampleError, Upsampler};
 use codec::{Decoder, DecoderError};
 
 use super::store::{self, StoreError};
@@ -137,6 +138,9 @@ pub enum ChunkError {
         /// What is wrong.
         source: DecoderError,
     },
+    /// An upsampler.
+    #[error(transparent)]
+    Upsampler(#[from] UpsampleError),
     /// Something that does not match what lists it.
     #[error("{what} is {found}, but {expected} is promised")]
     Mismatch {
@@ -150,7 +154,7 @@ pub enum ChunkError {
 }
 
 /// Reads a version (the head where `number` is `None`) and checks its signature, every chunk's
-/// hash, that every region decodes with the basis, that every state is covered, that the stated figures of
+/// hash, that every region decodes with the basis, that an upsampler can be read, that every state is covered, that the stated figures of
 /// states and merges are those of the links, and totality.
 ///
 /// # Errors
@@ -200,6 +204,11 @@ async fn inspect_garment(
     let states = pages.iter().map(|page| page.entries.len() as u64).sum();
     check_coverage(garment, &regions, states)?;
     check_figures(garment, &pages)?;
+    if let Some(upsampler) = &garment.upsampler {
+        let bytes = store::chunk(from, upsampler).await?;
+        let read = Upsampler::decode(&bytes).map_err(|e| wrong(upsampler.hash, e))?;
+        same(upsampler.hash, "fine vertices", read.fine() as u64, u64::from(mesh.vertex_count))?;
+    }
     let table = LinkTable::new(&pages, scene.poses.len(), &scene.edges);
     Ok(GarmentInspection {
         name: garment.name.clone(),
