@@ -3,22 +3,25 @@
 
 use std::time::Instant;
 
-use cloth::lab::{BENCHES, Report, Settings, find};
+use cloth::lab::{BENCHES, Limit, Report, Row, Settings, find};
 
-/// Figures that miss their threshold today, by bench and beginning of the row, with the reason.
-/// docs/results/stability.md has the figures. A test that names none of these must pass.
-const KNOWN_MISSES: &[(&str, &str)] = &[
-    // The linear solver's iterations end before a stiff panel, or a long strip, turns as one piece.
-    ("A3", "error of the period"),
-    ("A4", "error of the period"),
+/// Figures that miss their threshold today, by bench and beginning of the row, with the worst that each may
+/// become and the reason. docs/results/stability.md has the figures. What none of these names must pass.
+const KNOWN_MISSES: &[(&str, &str, f64)] = &[
+    // The linear solver's iterations end before a stiff panel turns as one piece.
+    ("A4", "error of the period from 90 deg", 2.0),
     // The linear solver stops before momentum is exact, and damping acts on turning too.
-    ("A12", "linear momentum"),
-    ("A12", "angular momentum"),
+    ("A12", "linear momentum", 0.05),
+    ("A12", "angular momentum lost per s at 6.28 rad/s, default damping", 35.0),
     // Backward Euler, and wrinkles whose motion it swallows.
-    ("A13", "lost in"),
-    ("A13", "loss per halving"),
+    ("A13", "lost in", 17.0),
+    ("A13", "loss per halving", 1.5),
     // Cloth of 10 N/m lies against the strain limit, whose last word adds energy.
-    ("B3", "fastest"),
+    ("B3", "fastest vertex of all", 9.3),
+    // Single vertices hop.
+    ("C1", "ball: speed at the end", 0.4),
+    ("C1", "spike: speed at the end", 0.4),
+    ("C3", "fastest vertex against the ball", 6.0),
 ];
 
 fn run(name: &str, quick: bool) -> Report {
@@ -37,23 +40,28 @@ fn run(name: &str, quick: bool) -> Report {
     report
 }
 
-/// Every figure passes, but for known misses.
-fn check(name: &str, quick: bool) {
+/// What does not pass and is no known miss within its bound.
+fn failures(name: &str, quick: bool) -> Vec<String> {
     let report = run(name, quick);
     assert!(!report.rows.is_empty());
-    let known = |what: &str| {
-        KNOWN_MISSES.iter().any(|(bench, row)| *bench == name && what.starts_with(row))
+    let known = |row: &Row| {
+        let found =
+            KNOWN_MISSES.iter().find(|(b, what, _)| *b == name && row.what.starts_with(what));
+        found.is_some_and(|(.., worst)| match row.limit {
+            Limit::AtMost(_) => row.figure <= *worst,
+            Limit::AtLeast(_) => row.figure >= *worst,
+        })
     };
-    for row in &report.rows {
-        assert!(
-            row.passes() || known(&row.what),
-            "{name}, {}: {} {} against {:?}",
-            row.what,
-            row.figure,
-            row.unit,
-            row.limit
-        );
-    }
+    let failed = report.rows.iter().filter(|row| !row.passes() && !known(row));
+    failed
+        .map(|r| format!("{name}, {}: {} {} against {:?}", r.what, r.figure, r.unit, r.limit))
+        .collect()
+}
+
+/// Every figure passes, but for known misses.
+fn check(name: &str, quick: bool) {
+    let failed = failures(name, quick);
+    assert!(failed.is_empty(), "{failed:#?}");
 }
 
 /// Where in a substep a rod meets cloth is chance, and so is where its triangles lie.
@@ -117,7 +125,8 @@ fn d3_two_threads_give_the_same_bits() {
 #[test]
 #[ignore = "minutes: the whole table"]
 fn the_whole_table() {
-    for bench in BENCHES {
-        check(bench.name, false);
-    }
+    // What D4 measures is time, and no test's business.
+    let benches = BENCHES.iter().filter(|bench| bench.name != "D4");
+    let failed: Vec<String> = benches.flat_map(|bench| failures(bench.name, false)).collect();
+    assert!(failed.is_empty(), "{failed:#?}");
 }
