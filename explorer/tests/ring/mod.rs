@@ -80,8 +80,15 @@ impl GraphView for Ring {
 
     fn stats(&self) -> VersionStats {
         let merges = self.runs.len() as u64;
-        let (states, worst_error_m) = (self.states(), 0.01);
-        VersionStats { poses: POSES, edges: POSES, states, merges, worst_error_m, ..<_>::default() }
+        VersionStats {
+            poses: POSES,
+            edges: POSES,
+            states: self.states(),
+            merges,
+            worst_error_m: 0.01,
+            mean_error_m: 0.01,
+            ..VersionStats::default()
+        }
     }
 }
 
