@@ -247,6 +247,15 @@ fn a_wrong_token_and_another_publisher_are_refused_at_once() {
     assert!(error.contains("publisher") && error.contains("pinned"), "{error}");
 }
 
+/// Waits until the client has seen that its server is gone.
+fn wait_until_alone(client: &Client) {
+    let deadline = Instant::now() + SOON;
+    while client.status().connected && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    assert!(!client.status().connected);
+}
+
 #[test]
 fn a_client_plays_on_while_its_server_is_gone_and_comes_back_to_it() {
     let identity = Identity::make();
@@ -257,11 +266,7 @@ fn a_client_plays_on_while_its_server_is_gone_and_comes_back_to_it() {
     client.wait_ready(SOON).unwrap();
     let mut character = client.character(None).unwrap();
     server.stop();
-    let deadline = Instant::now() + SOON;
-    while client.status().connected && Instant::now() < deadline {
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    assert!(!client.status().connected);
+    wait_until_alone(&client);
     for frame in 0..30u32 {
         assert_eq!(character.step(PoseId((frame + 1) % 2)), StepOutcome::Exact);
     }
@@ -329,10 +334,7 @@ fn what_is_walked_while_the_line_is_down_is_added_up_and_told_once() {
     client.wait_ready(SOON).unwrap();
     let mut character = client.character(None).unwrap();
     server.stop();
-    let deadline = Instant::now() + SOON;
-    while client.status().connected && Instant::now() < deadline {
-        std::thread::sleep(Duration::from_millis(10));
-    }
+    wait_until_alone(&client);
     // Longer than counts take to be reported, twice.
     for frame in 0..50u32 {
         character.step(PoseId((frame + 1) % 2));

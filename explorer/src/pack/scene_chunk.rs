@@ -95,7 +95,7 @@ fn capsule(joint: u16, points: &[Vec3]) -> Capsule {
 }
 
 /// Direction of largest extent, by power iteration on the covariance.
-fn main_axis(points: &[Vec3], centre: Vec3) -> Vec3 {
+pub(super) fn main_axis(points: &[Vec3], centre: Vec3) -> Vec3 {
     let mut axis = Vec3::new(0.6, 0.7, 0.4).normalize();
     for _ in 0..50 {
         let turned = points.iter().map(|p| (*p - centre) * (*p - centre).dot(axis)).sum::<Vec3>();

@@ -104,12 +104,9 @@ async fn readiness_says_what_lacks_and_liveness_that_the_server_runs() {
     server.shutdown().await;
 }
 
-#[tokio::test]
-async fn a_store_that_hangs_holds_no_shutdown_and_counts_are_written_once_it_can() {
-    let (world, store, server) = faulty(1).await;
-    let mut player = play_all(&server).await;
-    store.hanging_puts.store(1, Ordering::Relaxed);
-    player.machine.report(Telemetry {
+/// Five exact steps along one edge.
+fn five_steps() -> Telemetry {
+    Telemetry {
         garment: GarmentId(0),
         version: VersionNumber(1),
         edges: vec![(EdgeId(3), 5)],
@@ -117,7 +114,15 @@ async fn a_store_that_hangs_holds_no_shutdown_and_counts_are_written_once_it_can
         substituted: 0,
         missed: 0,
         jumps: 0,
-    });
+    }
+}
+
+#[tokio::test]
+async fn a_store_that_hangs_holds_no_shutdown_and_counts_are_written_once_it_can() {
+    let (world, store, server) = faulty(1).await;
+    let mut player = play_all(&server).await;
+    store.hanging_puts.store(1, Ordering::Relaxed);
+    player.machine.report(five_steps());
     player.until("a write that hangs", |_| store.hanging_puts.load(Ordering::Relaxed) == 0).await;
     let began = Instant::now();
     server.shutdown().await;
@@ -131,15 +136,7 @@ async fn a_store_that_hangs_holds_no_shutdown_and_counts_are_written_once_it_can
     play_all(&server).await;
     store.hanging_puts.store(u32::MAX, Ordering::Relaxed);
     let mut player = play_all(&server).await;
-    player.machine.report(Telemetry {
-        garment: GarmentId(0),
-        version: VersionNumber(1),
-        edges: vec![(EdgeId(3), 5)],
-        exact: 5,
-        substituted: 0,
-        missed: 0,
-        jumps: 0,
-    });
+    player.machine.report(five_steps());
     player.until("a count", |_| server.stats().traversals == 5).await;
     let began = Instant::now();
     server.shutdown().await;

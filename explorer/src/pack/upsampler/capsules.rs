@@ -4,6 +4,8 @@
 use cloth::{Body, Vec3};
 use codec::upsample::Capsule;
 
+use crate::pack::scene_chunk::main_axis;
+
 /// A capsule stands for this many vertices at least.
 const VERTICES_MIN: usize = 12;
 /// Capsules of a body.
@@ -117,16 +119,6 @@ fn along(points: &[Vec3], centre: Vec3, axis: Vec3) -> Fit {
     let ends = [low, high].map(|t| centre + axis * t);
     let off_m = points.iter().map(|p| (to_segment(*p, ends) - radius).abs()).sum();
     Fit { ends, radius, off_m }
-}
-
-/// Direction of largest extent, by power iteration on the covariance.
-fn main_axis(points: &[Vec3], centre: Vec3) -> Vec3 {
-    let mut axis = Vec3::new(0.6, 0.7, 0.4).normalize();
-    for _ in 0..50 {
-        let turned = points.iter().map(|p| (*p - centre) * (*p - centre).dot(axis)).sum::<Vec3>();
-        axis = turned.try_normalize().unwrap_or(axis);
-    }
-    axis
 }
 
 fn to_segment(p: Vec3, [a, b]: [Vec3; 2]) -> f32 {
