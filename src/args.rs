@@ -122,7 +122,8 @@ pub struct Explore {
     /// Working data [default: beside a local store].
     #[arg(long, value_name = "DIR")]
     pub work: Option<PathBuf>,
-    /// Stop when the store holds this many simulated frames.
+    /// Stop after the job with which the store holds this many simulated frames: a job adds up to
+    /// depth_frames along every branch, at most 512. The initial pass is made whole.
     #[arg(long)]
     pub frames: Option<u64>,
     /// Stop when the best prefix has no merge that costs more than this (mm): its error, and the
@@ -501,16 +502,18 @@ pub enum LabCommand {
 pub struct LabRun {
     /// Name of the bench, in either case.
     pub name: String,
-    /// Size of the mesh: vertices a side, or edges a length, as the bench says.
-    #[arg(long)]
+    /// Size of the mesh: vertices a side of a sheet, edges along a strip, rings of a disc. An option
+    /// that a bench does not read is refused; `toile lab list` says which it reads.
+    #[arg(long, conflicts_with = "vertices")]
     pub n: Option<u32>,
-    /// Vertices, about.
+    /// The same as a number of vertices, about; where a bench compares meshes, of the coarsest.
     #[arg(long)]
     pub vertices: Option<u32>,
-    /// One of the fabrics of `toile lab list` [default: the bench's own material].
+    /// One of the fabrics of `toile lab list` [default: the bench's own material]. Where the answer is
+    /// of cloth that cannot stretch or bend, only its weight and the other stiffness count.
     #[arg(long)]
     pub fabric: Option<String>,
-    /// Longest substep (s) [default: the solver's own].
+    /// Longest substep (s) [default: the solver's own, 1/120].
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     pub dt: Option<f32>,
     /// Fewer cases.

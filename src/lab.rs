@@ -27,6 +27,7 @@ struct Listed {
     about: &'static str,
     reference: &'static str,
     fast: bool,
+    options: Vec<String>,
 }
 
 #[derive(Serialize)]
@@ -51,6 +52,7 @@ fn list(json: bool) -> Result<()> {
             about: b.about,
             reference: b.reference,
             fast: b.fast,
+            options: b.reads.iter().map(|s| format!("--{}", s.name())).collect(),
         });
         let fabrics = FABRICS.iter().map(|f| ListedFabric {
             name: f.name,
@@ -62,9 +64,11 @@ fn list(json: bool) -> Result<()> {
         let everything = Everything { benches: benches.collect(), fabrics: fabrics.collect() };
         return format::print_json(&everything);
     }
-    println!("benches (toile lab run NAME):");
+    println!(
+        "benches (toile lab run NAME), and which of --n, --vertices, --fabric and --dt they read:"
+    );
     for b in BENCHES {
-        println!("  {:<4} {}", b.name, b.about);
+        println!("  {:<4} {}\n       {}", b.name, b.about, b.options());
     }
     println!("fabrics (--fabric NAME): kg/m2, warp and weft N/m, bending N m");
     for f in &FABRICS {

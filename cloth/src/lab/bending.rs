@@ -3,7 +3,8 @@
 use glam::Vec3;
 
 use super::shapes::{Cut, sheet};
-use super::{Bench, LabError, Limit, Sim, Stage};
+use super::{Bench, LabError, Limit, Setting, Sim, Stage};
+use crate::fabrics::Fabric;
 use crate::material::Material;
 use crate::model::{Environment, Model};
 
@@ -12,6 +13,7 @@ pub(crate) const A6: Bench = Bench {
     about: "clamped strip of 0.2 m bending under its weight, G = w L^3 / B = 1 to 100",
     reference: "exact elastica: tip drop and reach",
     fast: true,
+    reads: Setting::ALL,
     run: cantilevers,
 };
 
@@ -20,6 +22,7 @@ pub(crate) const A7: Bench = Bench {
     about: "overhang at which the chord is 41.5 deg, B = 7e-6 to 3e-4 N m",
     reference: "exact elastica: G = 8.004 there",
     fast: true,
+    reads: Setting::ALL,
     run: fixed_angle,
 };
 
@@ -37,9 +40,29 @@ const LENGTH: f32 = 0.2;
 const DENSITY: f32 = 0.2;
 const GRAVITY: f32 = 9.81;
 
+/// What of a fabric an elastica knows; it does not stretch.
+#[derive(Clone, Copy)]
+struct Cloth {
+    /// Areal density (kg/m^2).
+    density: f32,
+    /// Bending stiffness (N m).
+    bend: f32,
+}
+
+impl Cloth {
+    fn of(fabric: &Fabric) -> Self {
+        Self { density: fabric.density, bend: fabric.bend_mean() }
+    }
+}
+
+/// Edges across a strip.
+fn across(edges: u32) -> u32 {
+    (edges / 4).max(2)
+}
+
 fn cantilevers(stage: &mut Stage<'_>) -> Result<(), LabError> {
-    let n = stage.settings.n.unwrap_or(20);
-    let quick = stage.settings.quick;
+    let n = stage.edges(20, 4..=100, |n| (across(n) + 1) * (n + 1))?;
+    let quick = stage.quick();
     for (edges, most) in [(n, 3.0), (4 * n, 1.0)] {
         if quick && edges != n {
             break;
@@ -66,21 +89,21 @@ fn cantilevers(stage: &mut Stage<'_>) -> Result<(), LabError> {
 fn strip(
     stage: &mut Stage<'_>,
     length: f32,
-    bend: f32,
+    cloth: Cloth,
     edges: u32,
     cut: Cut,
     gravity: f32,
 ) -> Result<Sim, LabError> {
-    let wide = (edges / 4).max(2);
+    let wide = across(edges);
     let h = length / (edges as f32 - 0.5);
     let place = |u: f32, v: f32| Vec3::new(h * (u * edges as f32 - 0.5), 0.0, v * h * wide as f32);
     let mesh = sheet(edges, wide, cut, place)?;
     let held: Vec<u32> = (0..=wide).flat_map(|j| [j * (edges + 1), j * (edges + 1) + 1]).collect();
     let material = Material {
-        density: DENSITY,
+        density: cloth.density,
         stretch: 1000.0,
         shear: 500.0,
-        bend,
+        bend: cloth.bend,
         drag: 0.0,
         damping_s: 0.0,
         ..Material::default()
@@ -101,19 +124,28 @@ fn tip_of(sim: &Sim, edges: u32) -> (f64, f64) {
 
 /// Drop and reach over the length.
 fn tip(stage: &mut Stage<'_>, g: f32, edges: u32, cut: Cut) -> Result<(f64, f64), LabError> {
-    let bend = DENSITY * GRAVITY * LENGTH.powi(3) / g;
-    let mut sim = strip(stage, LENGTH, bend, edges, cut, GRAVITY)?;
+    // A fabric has its stiffness: then the length is what belongs to G.
+    let (length, cloth) = match stage.fabric().map(Cloth::of) {
+        Some(cloth) => ((g * cloth.bend / (cloth.density * GRAVITY)).cbrt(), cloth),
+        None => {
+            let bend = DENSITY * GRAVITY * LENGTH.powi(3) / g;
+            (LENGTH, Cloth { density: DENSITY, bend })
+        }
+    };
+    let mut sim = strip(stage, length, cloth, edges, cut, GRAVITY)?;
     stage.settle(&mut sim, None, 2e-4, 400)?;
     let (drop, reach) = tip_of(&sim, edges);
-    Ok((drop / f64::from(LENGTH), reach / f64::from(LENGTH)))
+    Ok((drop / f64::from(length), reach / f64::from(length)))
 }
 
 fn fixed_angle(stage: &mut Stage<'_>) -> Result<(), LabError> {
-    let edges = stage.settings.n.unwrap_or(20);
-    let stiff: &[f32] =
-        if stage.settings.quick { &[5e-5] } else { &[7e-6, 2e-5, 5e-5, 1e-4, 3e-4] };
-    let w = f64::from(DENSITY * GRAVITY);
-    for &bend in stiff {
+    let edges = stage.edges(20, 4..=200, |n| (across(n) + 1) * (n + 1))?;
+    let stiff: &[f32] = if stage.quick() { &[5e-5] } else { &[7e-6, 2e-5, 5e-5, 1e-4, 3e-4] };
+    let plain = || stiff.iter().map(|&bend| Cloth { density: DENSITY, bend }).collect();
+    let cloths: Vec<Cloth> = stage.fabric().map_or_else(plain, |fabric| vec![Cloth::of(fabric)]);
+    for cloth in cloths {
+        let w = f64::from(cloth.density * GRAVITY);
+        let bend = cloth.bend;
         // The overhang that belongs to this stiffness; then the load at which the chord hangs at
         // 41.5 degrees is searched for (angle and load are about in proportion).
         let length = 2.0003 * (f64::from(bend) / w).cbrt();
@@ -121,7 +153,7 @@ fn fixed_angle(stage: &mut Stage<'_>) -> Result<(), LabError> {
         let mut tried: Vec<(f64, f64)> = Vec::new();
         for _ in 0..4 {
             let gravity = GRAVITY * factor as f32;
-            let mut sim = strip(stage, length as f32, bend, edges, Cut::Alternating, gravity)?;
+            let mut sim = strip(stage, length as f32, cloth, edges, Cut::Alternating, gravity)?;
             stage.settle(&mut sim, None, 2e-4, 400)?;
             let (drop, reach) = tip_of(&sim, edges);
             let off = drop.atan2(reach).to_degrees() - 41.5;

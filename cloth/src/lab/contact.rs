@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::{Quat, Vec3};
 
 use super::shapes::{Cut, ellipsoids, pose_at, sheet, slab};
-use super::{Bench, LabError, Limit, Sim, Stage};
+use super::{Bench, LabError, Limit, Setting, Sim, Stage};
 use crate::body::{Body, Pose};
 use crate::material::Material;
 use crate::measure;
@@ -17,6 +17,7 @@ pub(crate) const C1: Bench = Bench {
     about: "sheet dropped on a ball, on the edge of a box and on a spike, 5 s each",
     reference: "no vertex inside, no crossing, rest",
     fast: false,
+    reads: Setting::ALL,
     run: on_shapes,
 };
 
@@ -25,6 +26,7 @@ pub(crate) const C2: Bench = Bench {
     about: "rod of 4 cm swept through a floating sheet at 1, 2, 5, 10 and 20 m/s, at 30 frames/s",
     reference: "no vertex on the wrong side",
     fast: false,
+    reads: Setting::ALL,
     run: swept,
 };
 
@@ -33,6 +35,7 @@ pub(crate) const C3: Bench = Bench {
     about: "two balls close on a hanging sheet until they overlap by 10 mm, hold it 1 s, open",
     reference: "finite, calm and clean soon after",
     fast: false,
+    reads: Setting::ALL,
     run: pinched,
 };
 
@@ -41,6 +44,7 @@ pub(crate) const C4: Bench = Bench {
     about: "a figure of ellipsoids in a skirt turns cartwheels at one turn a second",
     reference: "no lasting tangle, no vertex deep inside",
     fast: false,
+    reads: &[Setting::Fabric, Setting::Dt],
     run: cartwheel,
 };
 
@@ -50,6 +54,7 @@ pub(crate) const C5: Bench = Bench {
             cross when they start",
     reference: "no crossing in any frame; none after 60 frames where it starts with some",
     fast: false,
+    reads: &[Setting::Fabric, Setting::Dt],
     run: against_itself,
 };
 
@@ -58,6 +63,7 @@ pub(crate) const C6: Bench = Bench {
     about: "three skirts over each other on a walking figure for 5 s, and started in wrong order",
     reference: "the order of the layers",
     fast: false,
+    reads: &[Setting::Fabric, Setting::Dt],
     run: layers,
 };
 
@@ -79,7 +85,7 @@ fn on_shapes(stage: &mut Stage<'_>) -> Result<(), LabError> {
         ("box edge", slab(Vec3::new(0.3, 0.3, 0.0), Vec3::new(0.3, 0.3, 0.8))),
         ("spike", ellipsoids(&spike, 24)),
     ];
-    let frames = if stage.settings.quick { 60 } else { 150 };
+    let frames = if stage.quick() { 60 } else { 150 };
     for (name, body) in shapes {
         let mesh =
             sheet(n - 1, n - 1, Cut::Alternating, |u, v| Vec3::new(u - 0.45, 0.65, v - 0.5))?;
@@ -244,7 +250,7 @@ fn cartwheel(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let model = Model::new(skirt, material, Environment::default(), Some(body.clone()), &held)?;
     let mut sim = stage.sim(model, FRAME_S);
     sim.hits_every = 1;
-    let turns = if stage.settings.quick { 3 } else { 20 };
+    let turns = if stage.quick() { 3 } else { 20 };
     let pose = |f: u32| {
         // One turn a second, after a second of rest; in the last turn one frame is a jump.
         let turn = (f as f32 - 30.0).max(0.0) / 30.0 + if f > 30 * turns { 0.1 } else { 0.0 };
@@ -281,7 +287,7 @@ fn against_itself(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let material = stage.material(Material::default());
     let mut sim = stage.sim(Model::new(ribbon, material, ground(), None, &[])?, FRAME_S);
     sim.hits_every = 1;
-    for _ in 0..if stage.settings.quick { 45 } else { 120 } {
+    for _ in 0..if stage.quick() { 45 } else { 120 } {
         stage.step(&mut sim, None)?;
     }
     let hits = stage.hits as f64;
@@ -313,7 +319,7 @@ fn folded(stage: &mut Stage<'_>) -> Result<(), LabError> {
         p.z = there * (layer - rise);
     }
     sim.hits_every = 1;
-    for _ in 0..if stage.settings.quick { 30 } else { 90 } {
+    for _ in 0..if stage.quick() { 30 } else { 90 } {
         stage.step(&mut sim, None)?;
     }
     Ok(())
@@ -331,7 +337,7 @@ fn twisted(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let model = Model::new(mesh, material, calm, Some(body.clone()), &held)?;
     let mut sim = stage.sim(model, FRAME_S);
     sim.hits_every = 1;
-    let frames = if stage.settings.quick { 40 } else { 120 };
+    let frames = if stage.quick() { 40 } else { 120 };
     let turns = 2.0 * frames as f32 / 120.0;
     let pose = |f: u32| {
         let mut pose = body.skeleton.rest_pose();
@@ -404,7 +410,7 @@ fn layers(stage: &mut Stage<'_>) -> Result<(), LabError> {
 }
 
 fn walk(stage: &mut Stage<'_>, sim: &mut Sim, body: &Body) -> Result<(), LabError> {
-    let frames = if stage.settings.quick { 60 } else { 150 };
+    let frames = if stage.quick() { 60 } else { 150 };
     let pose = |f: u32| {
         let phase = std::f32::consts::TAU * f as f32 / 30.0;
         let mut pose = stride(body, phase, 0.4 * (f as f32 / 20.0).min(1.0));

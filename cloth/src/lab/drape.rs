@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::shapes::{Chance, disc};
-use super::{Bench, LabError, Limit, Stage};
+use super::{Bench, LabError, Limit, Setting, Stage};
 use crate::fabrics::{FABRICS, Fabric, find};
 use crate::material::Material;
 use crate::model::{Environment, Model};
@@ -13,6 +13,7 @@ pub(crate) const A8: Bench = Bench {
     about: "Cusick drape: disc of 30 cm over a support of 18 cm, ten fabrics",
     reference: "own run at 4 times the vertices; drape rises with B / w",
     fast: false,
+    reads: Setting::ALL,
     run: drapes,
 };
 
@@ -24,12 +25,11 @@ const CELL_M: f32 = 5e-4;
 const REPEATS: f64 = 3.0;
 
 fn drapes(stage: &mut Stage<'_>) -> Result<(), LabError> {
-    let vertices = stage.settings.vertices.unwrap_or(2000);
-    let rings = rings_of(vertices);
-    let asked = stage.settings.fabric.copied();
+    let rings = stage.edges(26, 4..=120, |rings| 1 + 3 * rings * (rings + 1))?;
+    let asked = stage.fabric().copied();
     let mut fabrics: Vec<Fabric> = asked.map_or(FABRICS.to_vec(), |f| vec![f]);
     fabrics.sort_by(|a, b| stiffness(a).total_cmp(&stiffness(b)));
-    let chosen = if stage.settings.quick { 4 } else { 1 };
+    let chosen = if stage.quick() { 4 } else { 1 };
     let plain = Material::default();
     for own in [true, false] {
         let mut found: Vec<f64> = Vec::new();
@@ -50,26 +50,28 @@ fn drapes(stage: &mut Stage<'_>) -> Result<(), LabError> {
         // repeats to within counts as level.
         stage.row(what, falls, "points", reference, Limit::AtMost(REPEATS));
     }
-    if stage.settings.quick {
+    if stage.quick() {
         return Ok(());
     }
-    let denim = find("denim").unwrap_or(&FABRICS[0]).material();
-    let plain = drape(stage, denim, rings, 0.0)?;
-    let turned = drape(stage, denim, rings, std::f32::consts::FRAC_PI_4)?;
+    let one = asked.or(find("denim").copied()).unwrap_or(FABRICS[0]);
+    let (name, one) = (one.name, one.material());
+    let plain = drape(stage, one, rings, 0.0)?;
+    let turned = drape(stage, one, rings, std::f32::consts::FRAC_PI_4)?;
     let reference = format!("{plain:.1}");
     let moved = (turned - plain).abs();
-    stage.row("mesh turned by 45 deg, denim", moved, "points", reference, Limit::AtMost(REPEATS));
-    let fine = drape(stage, denim, 2 * rings, 0.0)?;
+    stage.row(
+        format!("mesh turned by 45 deg, {name}"),
+        moved,
+        "points",
+        reference,
+        Limit::AtMost(REPEATS),
+    );
+    let fine = drape(stage, one, 2 * rings, 0.0)?;
     let moved = (fine - plain).abs();
     let reference = format!("{fine:.1} at 4 times the vertices");
-    let what = "against 4 times the vertices, denim";
+    let what = format!("against 4 times the vertices, {name}");
     stage.row(what, moved, "points", reference, Limit::AtMost(REPEATS));
     Ok(())
-}
-
-/// Rings of a disc with about so many vertices: 1 + 3 r (r + 1).
-fn rings_of(vertices: u32) -> u32 {
-    ((f64::from(vertices) / 3.0).sqrt().round() as u32).clamp(4, 120)
 }
 
 fn stiffness(f: &Fabric) -> f32 {

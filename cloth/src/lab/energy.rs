@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3A};
 
 use super::sheets::{pinned_material, pinned_sheet};
-use super::{Bench, LabError, Limit, Sim, Stage};
+use super::{Bench, LabError, Limit, Setting, Sim, Stage};
 use crate::solver::membrane::{LIMIT_FACTOR, SOFT_STRAIN};
 
 pub(crate) const A13: Bench = Bench {
@@ -11,6 +11,7 @@ pub(crate) const A13: Bench = Bench {
     about: "total energy of S1 during its first fall (0.84 s), at two steps",
     reference: "never rises; backward Euler loses 1 - exp(-w^2 dt t), w = 3.76 rad/s",
     fast: true,
+    reads: &[Setting::N, Setting::Vertices, Setting::Fabric],
     run: falling_energy,
 };
 

@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::shapes::{Cut, sheet};
-use super::{Bench, LabError, Limit, Stage};
+use super::{Bench, LabError, Limit, Setting, Stage};
 use crate::material::Material;
 use crate::measure;
 use crate::model::{Environment, Model};
@@ -13,6 +13,7 @@ pub(crate) const A1: Bench = Bench {
     about: "free fall of a sheet for 1 s, without air",
     reference: "z = -g t^2 / 2",
     fast: true,
+    reads: Setting::ALL,
     run: free_fall,
 };
 
@@ -21,6 +22,7 @@ pub(crate) const A9: Bench = Bench {
     about: "terminal speed of a horizontal sheet, drag 1.28",
     reference: "v = sqrt(2 s g / (rho Cd)): 1.58 m/s for 0.2 kg/m2",
     fast: true,
+    reads: Setting::ALL,
     run: terminal_speed,
 };
 

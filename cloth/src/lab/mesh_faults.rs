@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::shapes::{Chance, Cut, sheet};
-use super::{Bench, LabError, Limit, Stage};
+use super::{Bench, LabError, Limit, Setting, Stage};
 use crate::material::Material;
 use crate::mesh::{Mesh, MeshError};
 use crate::model::{Environment, Model};
@@ -13,6 +13,7 @@ pub(crate) const B4: Bench = Bench {
     about: "slivers 1:20, a vertex of 12 neighbours, areas x100; non-manifold refused",
     reference: "finite, energy falls; refused by name",
     fast: true,
+    reads: &[Setting::Fabric, Setting::Dt],
     run: bad_meshes,
 };
 

@@ -27,7 +27,7 @@ mod stage;
 mod sweep;
 mod swing;
 
-pub use stage::{Settings, Shot, Sim, Stage, Tally};
+pub use stage::{Setting, Settings, Shot, Sim, Stage, Tally};
 
 use crate::mesh::MeshError;
 use crate::model::ModelError;
@@ -44,6 +44,8 @@ pub struct Bench {
     pub reference: &'static str,
     /// Whether it belongs to the part that runs with every test.
     pub fast: bool,
+    /// What it can be asked for; anything else is refused, not ignored.
+    pub reads: &'static [Setting],
     run: fn(&mut Stage<'_>) -> Result<(), LabError>,
 }
 
@@ -71,6 +73,19 @@ pub enum LabError {
         /// Largest.
         most: f64,
     },
+    /// A parameter that the bench does not read.
+    #[error("{bench} does not read --{name}; it reads {reads}")]
+    Unread {
+        /// The bench.
+        bench: &'static str,
+        /// The parameter.
+        name: &'static str,
+        /// What it reads, for a message.
+        reads: String,
+    },
+    /// The size of the mesh was given twice.
+    #[error("--n and --vertices both say how large the mesh is; give one of them")]
+    Both,
     /// The bench's mesh was refused.
     #[error(transparent)]
     Mesh(#[from] MeshError),
@@ -187,20 +202,25 @@ pub fn find(name: &str) -> Result<&'static Bench, LabError> {
 }
 
 impl Bench {
+    /// The options that it reads, for people: `--n, --dt`.
+    pub fn options(&self) -> String {
+        self.reads.iter().map(|s| format!("--{}", s.name())).collect::<Vec<_>>().join(", ")
+    }
+
     /// Runs the bench.
     ///
     /// * `clock`: the processor time used so far (s), or anything that rises evenly.
     /// * `watch`: is shown every frame; to return false stops the bench.
     ///
     /// # Errors
-    /// A parameter out of range, a step that is not finite, or the caller's wish to stop.
+    /// A parameter out of range or not read, a step that is not finite, or the caller's wish to stop.
     pub fn run(
         &self,
         settings: Settings,
         clock: &mut dyn FnMut() -> f64,
         watch: &mut dyn FnMut(&Shot<'_>) -> bool,
     ) -> Result<Report, LabError> {
-        settings.check()?;
+        settings.check(self)?;
         let mut stage = Stage::new(settings, clock, watch);
         (self.run)(&mut stage)?;
         let (rows, tally) = stage.finish();
@@ -251,5 +271,53 @@ mod tests {
         assert!(error.to_string().starts_with("--n 1"), "{error}");
         let dt = Settings { dt_s: Some(f32::NAN), ..Settings::default() };
         assert!(find("S1").unwrap().run(dt, &mut || 0.0, &mut |_| true).is_err());
+    }
+
+    /// Asked for everything, up to its first frame.
+    fn began(bench: &Bench, settings: Settings) -> (Vec<Setting>, Result<(), LabError>) {
+        let (mut clock, mut watch) = (|| 0.0, |_: &Shot<'_>| false);
+        let mut stage = Stage::new(settings, &mut clock, &mut watch);
+        let ended = (bench.run)(&mut stage);
+        (stage.read(), ended)
+    }
+
+    #[test]
+    fn a_bench_reads_what_it_says_and_refuses_the_rest() {
+        let dt_s = Some(1.0 / 170.0);
+        let fabric = crate::fabrics::find("sweater");
+        for bench in BENCHES {
+            let by_n = Settings { n: Some(20), fabric, dt_s, ..Settings::default() };
+            let by_count = Settings { vertices: Some(900), n: None, ..by_n };
+            let mut read = began(bench, by_n).0;
+            read.extend(began(bench, by_count).0);
+            for setting in Setting::ALL {
+                let name = bench.name;
+                let reads = bench.reads.contains(setting);
+                assert_eq!(read.contains(setting), reads, "{name} and --{}", setting.name());
+                if !reads {
+                    let only = setting.only(&by_n, &by_count);
+                    let error = bench.run(only, &mut || 0.0, &mut |_| true).unwrap_err();
+                    let (said, options) = (error.to_string(), bench.options());
+                    let refused = format!("{name} does not read --{}; it", setting.name());
+                    assert!(said.starts_with(&refused) && said.ends_with(&options), "{said}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_coarsest_mesh_is_refused_or_simulated() {
+        for bench in BENCHES.iter().filter(|bench| bench.reads.contains(&Setting::N)) {
+            for n in [2, 3, 5] {
+                let settings = Settings { n: Some(n), ..Settings::default() };
+                match began(bench, settings).1 {
+                    Err(LabError::Stopped) => {}
+                    Err(LabError::Parameter { name: "n", least, most, .. }) => {
+                        assert!(!(least..=most).contains(&f64::from(n)), "{} {n}", bench.name);
+                    }
+                    other => panic!("{} --n {n}: {other:?}", bench.name),
+                }
+            }
+        }
     }
 }

@@ -5,7 +5,7 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 
 use super::shapes::{Cut, sheet};
-use super::{Bench, LabError, Limit, Sim, Stage};
+use super::{Bench, LabError, Limit, Setting, Sim, Stage};
 use crate::material::Material;
 use crate::model::{Environment, Model};
 
@@ -14,12 +14,13 @@ pub(crate) const A12: Bench = Bench {
     about: "crumpled sheet without gravity, drifting, spinning at 3 and 6.28 rad/s, 5 s",
     reference: "linear momentum exact; backward Euler loses W^2 dt / 2 of the angular per s",
     fast: true,
+    reads: Setting::ALL,
     run: drifting,
 };
 
 fn drifting(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let n = stage.side(17) - 1;
-    let seconds = if stage.settings.quick { 2.0 } else { 5.0 };
+    let seconds = if stage.quick() { 2.0 } else { 5.0 };
     let damped = Material::default().damping_s;
     for (spin, damping_s) in [(3.0f32, 0.0), (TAU, 0.0), (TAU, damped)] {
         let mut sim = crumpled(stage, n, spin, damping_s)?;

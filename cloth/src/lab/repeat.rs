@@ -4,7 +4,7 @@
 use glam::Vec3;
 
 use super::shapes::{Cut, ellipsoids, pose_at, sheet};
-use super::{Bench, LabError, Limit, Sim, Stage};
+use super::{Bench, LabError, Limit, Setting, Sim, Stage};
 use crate::material::Material;
 use crate::model::{Environment, Model, State};
 
@@ -13,6 +13,7 @@ pub(crate) const D2: Bench = Bench {
     about: "sheet swept by a ball, stopped after each frame and restarted from its state",
     reference: "the uninterrupted run, bit for bit",
     fast: true,
+    reads: Setting::ALL,
     run: restart,
 };
 
@@ -21,6 +22,7 @@ pub(crate) const D3: Bench = Bench {
     about: "the same input twice, after other work in the same memory",
     reference: "bit-identical (on two threads: cargo test -p cloth)",
     fast: true,
+    reads: Setting::ALL,
     run: repeat,
 };
 

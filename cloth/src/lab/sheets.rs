@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::shapes::{Cut, ellipsoids, sheet};
-use super::{Bench, LabError, Limit, Sim, Stage};
+use super::{Bench, LabError, Limit, Setting, Sim, Stage};
 use crate::body::Pose;
 use crate::material::Material;
 use crate::measure;
@@ -14,6 +14,7 @@ pub(crate) const S1: Bench = Bench {
     about: "sheet of 1 m x 1 m, 0.2 kg/m2, 1000 N/m, two corners pinned, released flat, 2 s",
     reference: "other simulators: docs/results/peers.md",
     fast: false,
+    reads: Setting::ALL,
     run: pinned,
 };
 
@@ -22,6 +23,7 @@ pub(crate) const S2: Bench = Bench {
     about: "the same sheet dropped 5 cm onto a ball of 0.25 m, friction 0.3, 2 s",
     reference: "other simulators: docs/results/peers.md",
     fast: false,
+    reads: Setting::ALL,
     run: on_ball,
 };
 
@@ -30,6 +32,7 @@ pub(crate) const B1: Bench = Bench {
     about: "S1 at 32 x 32 with the step halved twice, first 0.6 s",
     reference: "the same run at a quarter of the finest step",
     fast: false,
+    reads: &[Setting::N, Setting::Vertices, Setting::Fabric],
     run: halved_steps,
 };
 
@@ -38,6 +41,7 @@ pub(crate) const B2: Bench = Bench {
     about: "S1 on 10 x 10 to 173 x 173 vertices",
     reference: "the finest mesh",
     fast: false,
+    reads: &[Setting::Fabric, Setting::Dt],
     run: finer_meshes,
 };
 
@@ -47,7 +51,7 @@ const BALL_M: f32 = 0.25;
 const DROP_M: f32 = 0.05;
 
 /// The peers' sheet has no air and no damping of its own.
-fn material() -> Material {
+pub(crate) fn material() -> Material {
     Material { drag: 0.0, damping_s: 0.0, shear: 385.0, bend: 1e-4, ..Material::default() }
 }
 
@@ -193,7 +197,7 @@ fn halved_steps(stage: &mut Stage<'_>) -> Result<(), LabError> {
 }
 
 fn finer_meshes(stage: &mut Stage<'_>) -> Result<(), LabError> {
-    let sizes: &[u32] = if stage.settings.quick { &[10, 20, 40] } else { &[10, 32, 100, 173] };
+    let sizes: &[u32] = if stage.quick() { &[10, 20, 40] } else { &[10, 32, 100, 173] };
     let mut found = Vec::new();
     for &n in sizes {
         let material = pinned_material(stage);

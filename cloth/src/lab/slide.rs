@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::shapes::{Cut, pose_at, sheet, slab};
-use super::{Bench, LabError, Limit, Stage};
+use super::{Bench, LabError, Limit, Setting, Stage};
 use crate::material::Material;
 use crate::model::{Environment, Model};
 
@@ -12,6 +12,7 @@ pub(crate) const A10: Bench = Bench {
     about: "sheet on an incline of the ground and of a body, friction 0.4",
     reference: "sticks below 21.8 deg, else a = g (sin a - mu cos a)",
     fast: true,
+    reads: Setting::ALL,
     run: incline,
 };
 

@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::shapes::{Chance, Cut, ellipsoids, pose_at, sheet};
-use super::{Bench, LabError, Limit, Stage};
+use super::{Bench, LabError, Limit, Setting, Stage};
 use crate::material::Material;
 use crate::measure;
 use crate::model::{Environment, Model};
@@ -13,6 +13,7 @@ pub(crate) const D1: Bench = Bench {
     about: "soak: a hanging sheet of 2,025 vertices, 2,000 frames among two balls moving by chance",
     reference: "the whole size: toile simulate --soak",
     fast: false,
+    reads: &[Setting::N, Setting::Vertices, Setting::Fabric],
     run: soak,
 };
 
@@ -22,7 +23,7 @@ const SPEED_MAX_M_S: f32 = 30.0;
 
 fn soak(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let n = stage.side(45) - 1;
-    let frames = if stage.settings.quick { 300 } else { 2000 };
+    let frames = if stage.quick() { 300 } else { 2000 };
     let mesh = sheet(n, n, Cut::Alternating, |u, v| Vec3::new(u - 0.5, 1.2 - v, 0.0))?;
     let parts = [
         (Vec3::new(0.0, 0.6, 0.4), Vec3::splat(0.15)),

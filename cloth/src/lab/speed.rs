@@ -1,13 +1,14 @@
 //! D4: what S1 and S2 cost at the sizes that garments have.
 
 use super::sheets::{ball_sheet, pinned_material, pinned_sheet};
-use super::{Bench, LabError, Limit, Stage};
+use super::{Bench, LabError, Limit, Setting, Stage};
 
 pub(crate) const D4: Bench = Bench {
     name: "D4",
     about: "cost of S1 and S2 at 5,041, 10,000 and 29,929 vertices",
     reference: "0.05, 0.1, 0.3 s per 1/30 s; the peers: docs/results/peers.md",
     fast: false,
+    reads: &[Setting::Fabric, Setting::Dt],
     run: costs,
 };
 
@@ -16,7 +17,7 @@ const FRAMES: u32 = 72;
 
 fn costs(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let sizes = [(71u32, 0.05f64), (100, 0.1), (173, 0.3)];
-    let chosen = if stage.settings.quick { 1 } else { sizes.len() };
+    let chosen = if stage.quick() { 1 } else { sizes.len() };
     for (n, most) in sizes.into_iter().take(chosen) {
         for on_ball in [false, true] {
             let (mut sim, pose) = if on_ball {

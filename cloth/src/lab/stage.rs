@@ -1,8 +1,11 @@
 //! Where benches run: steps that are timed, shown and measured.
 
+use std::cell::Cell;
+use std::ops::RangeInclusive;
+
 use glam::Vec3;
 
-use super::{LabError, Limit, Row};
+use super::{Bench, LabError, Limit, Row};
 use crate::body::Pose;
 use crate::crossings::Crossings;
 use crate::fabrics::Fabric;
@@ -11,12 +14,62 @@ use crate::measure;
 use crate::model::{Model, State};
 use crate::solver::{Effort, SUBSTEP_S_MAX, Span, Workspace, step};
 
+/// What a bench can be asked for, beside fewer cases.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Setting {
+    /// [`Settings::n`].
+    N,
+    /// [`Settings::vertices`].
+    Vertices,
+    /// [`Settings::fabric`].
+    Fabric,
+    /// [`Settings::dt_s`].
+    Dt,
+}
+
+impl Setting {
+    /// All there are.
+    pub const ALL: &'static [Setting] =
+        &[Setting::N, Setting::Vertices, Setting::Fabric, Setting::Dt];
+
+    /// Its name as an option.
+    pub fn name(self) -> &'static str {
+        match self {
+            Setting::N => "n",
+            Setting::Vertices => "vertices",
+            Setting::Fabric => "fabric",
+            Setting::Dt => "dt",
+        }
+    }
+
+    /// Nothing but this one of what is asked for.
+    #[cfg(test)]
+    pub(super) fn only(self, by_n: &Settings, by_count: &Settings) -> Settings {
+        let none = Settings::default();
+        match self {
+            Setting::N => Settings { n: by_n.n, ..none },
+            Setting::Vertices => Settings { vertices: by_count.vertices, ..none },
+            Setting::Fabric => Settings { fabric: by_n.fabric, ..none },
+            Setting::Dt => Settings { dt_s: by_n.dt_s, ..none },
+        }
+    }
+
+    fn is_in(self, settings: &Settings) -> bool {
+        match self {
+            Setting::N => settings.n.is_some(),
+            Setting::Vertices => settings.vertices.is_some(),
+            Setting::Fabric => settings.fabric.is_some(),
+            Setting::Dt => settings.dt_s.is_some(),
+        }
+    }
+}
+
 /// What a caller may set.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Settings {
     /// Size of the mesh, as the bench understands it: vertices a side, edges a length.
     pub n: Option<u32>,
-    /// Number of vertices, about; wins over `n` where a bench takes it.
+    /// Number of vertices, about, in place of `n`; of the coarsest mesh where a bench compares some.
     pub vertices: Option<u32>,
     /// Fabric instead of the bench's own material.
     pub fabric: Option<&'static Fabric>,
@@ -27,11 +80,19 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// Checks the ranges.
+    /// Checks the ranges, and that the bench reads all of it.
     ///
     /// # Errors
-    /// Names the first parameter that is out of range.
-    pub fn check(&self) -> Result<(), LabError> {
+    /// Names the first parameter that is out of range or not read.
+    pub fn check(&self, bench: &Bench) -> Result<(), LabError> {
+        let unread = |s: &&Setting| s.is_in(self) && !bench.reads.contains(s);
+        if let Some(setting) = Setting::ALL.iter().find(unread) {
+            let (name, reads) = (setting.name(), bench.options());
+            return Err(LabError::Unread { bench: bench.name, name, reads });
+        }
+        if self.n.is_some() && self.vertices.is_some() {
+            return Err(LabError::Both);
+        }
         let given = [
             ("n", self.n.map(f64::from), 2.0, 400.0),
             ("vertices", self.vertices.map(f64::from), 4.0, 160_000.0),
@@ -167,8 +228,8 @@ impl Sim {
 
 /// Where a bench runs.
 pub struct Stage<'a> {
-    /// What the caller set.
-    pub settings: Settings,
+    settings: Settings,
+    read: Cell<[bool; 4]>,
     /// What was measured so far; a bench may correct it.
     pub tally: Tally,
     /// Most crossings in any frame looked at since the bench last took this.
@@ -187,7 +248,8 @@ impl<'a> Stage<'a> {
         watch: &'a mut dyn FnMut(&Shot<'_>) -> bool,
     ) -> Self {
         let tally = Tally::default();
-        Self { settings, tally, hits: 0, clock, watch, rows: Vec::new(), runs: 0 }
+        let (rows, read) = (Vec::new(), Cell::default());
+        Self { settings, read, tally, hits: 0, clock, watch, rows, runs: 0 }
     }
 
     /// The figures and measures.
@@ -197,13 +259,67 @@ impl<'a> Stage<'a> {
 
     /// Vertices a side of a square sheet, as asked or `default`.
     pub fn side(&self, default: u32) -> u32 {
+        self.mark(Setting::N);
+        self.mark(Setting::Vertices);
         let of_count = |v: u32| (f64::from(v).sqrt().round() as u32).clamp(2, 400);
         self.settings.vertices.map(of_count).or(self.settings.n).unwrap_or(default)
     }
 
+    /// Edges a length (or rings) of a mesh, as asked or `default`. `count` says how many vertices
+    /// belong to them, and grows.
+    ///
+    /// # Errors
+    /// A size outside `range`, or of a mesh outside it.
+    pub fn edges(
+        &self,
+        default: u32,
+        range: RangeInclusive<u32>,
+        count: impl Fn(u32) -> u32,
+    ) -> Result<u32, LabError> {
+        self.mark(Setting::N);
+        self.mark(Setting::Vertices);
+        let (least, most) = (*range.start(), *range.end());
+        let within = |name, value: u32, least: u32, most: u32| {
+            let [value, least, most] = [value, least, most].map(f64::from);
+            let error = LabError::Parameter { name, value, least, most };
+            if value >= least && value <= most { Ok(()) } else { Err(error) }
+        };
+        if let Some(vertices) = self.settings.vertices {
+            within("vertices", vertices, count(least), count(most))?;
+            let off = |n: &u32| count(*n).abs_diff(vertices);
+            return Ok(range.min_by_key(off).unwrap_or(default));
+        }
+        let n = self.settings.n.unwrap_or(default);
+        within("n", n, least, most)?;
+        Ok(n)
+    }
+
+    /// Whether fewer cases do.
+    pub fn quick(&self) -> bool {
+        self.settings.quick
+    }
+
+    /// The fabric that was asked for.
+    pub fn fabric(&self) -> Option<&'static Fabric> {
+        self.mark(Setting::Fabric);
+        self.settings.fabric
+    }
+
+    fn mark(&self, setting: Setting) {
+        let mut read = self.read.get();
+        read[setting as usize] = true;
+        self.read.set(read);
+    }
+
+    /// What was read so far.
+    #[cfg(test)]
+    pub(super) fn read(&self) -> Vec<Setting> {
+        Setting::ALL.iter().copied().filter(|s| self.read.get()[*s as usize]).collect()
+    }
+
     /// The bench's material, or the fabric that was asked for, without air.
     pub fn material(&self, default: Material) -> Material {
-        let Some(fabric) = self.settings.fabric else { return default };
+        let Some(fabric) = self.fabric() else { return default };
         let keep = Material { ..default };
         Material {
             friction: keep.friction,
@@ -240,6 +356,9 @@ impl<'a> Stage<'a> {
     /// # Errors
     /// A state that is not finite, or the caller's wish to stop.
     pub fn step(&mut self, sim: &mut Sim, motion: Option<(&Pose, &Pose)>) -> Result<(), LabError> {
+        if Some(sim.dt_s) == self.settings.dt_s {
+            self.mark(Setting::Dt);
+        }
         let refine = (SUBSTEP_S_MAX / sim.dt_s - 1e-3).ceil().max(1.0) as u32;
         let span = Span { motion, seconds: sim.frame_s, refine };
         let start = (self.clock)();

@@ -1,8 +1,8 @@
 //! B3: any stiffness, any weight, any step.
 
 use super::energy::total;
-use super::sheets::{pinned_material, pinned_sheet};
-use super::{Bench, LabError, Limit, Stage};
+use super::sheets::{material, pinned_sheet};
+use super::{Bench, LabError, Limit, Setting, Stage};
 use crate::material::Material;
 
 pub(crate) const B3: Bench = Bench {
@@ -10,12 +10,13 @@ pub(crate) const B3: Bench = Bench {
     about: "S1 over Eh 10 to 1e5 N/m, B 0 to 1e-3 N m, 0.05 to 0.6 kg/m2, frames 1/30 to 1/480 s",
     reference: "no NaN, no vertex over 2 sqrt(2 g h), no rise of energy",
     fast: false,
+    reads: &[Setting::N, Setting::Vertices, Setting::Dt],
     run: stiffnesses,
 };
 
 fn stiffnesses(stage: &mut Stage<'_>) -> Result<(), LabError> {
     let n = stage.side(12);
-    let quick = stage.settings.quick;
+    let quick = stage.quick();
     let pick = |all: &[f32]| -> Vec<f32> {
         if quick { vec![all[0], all[all.len() - 1]] } else { all.to_vec() }
     };
@@ -25,7 +26,7 @@ fn stiffnesses(stage: &mut Stage<'_>) -> Result<(), LabError> {
             for &density in &pick(&[0.05, 0.2, 0.6]) {
                 for &frame_s in &pick(&[1.0 / 30.0, 1.0 / 60.0, 1.0 / 120.0, 1.0 / 480.0]) {
                     cases += 1;
-                    let base = pinned_material(stage);
+                    let base = material();
                     let shear = 0.385 * stretch;
                     let material = Material { stretch, shear, bend, density, ..base };
                     match swing(stage, n, material, frame_s) {

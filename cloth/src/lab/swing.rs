@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::shapes::{Cut, sheet};
-use super::{Bench, LabError, Limit, Sim, Stage};
+use super::{Bench, LabError, Limit, Setting, Sim, Stage};
 use crate::material::Material;
 use crate::model::{Environment, Model};
 
@@ -12,6 +12,7 @@ pub(crate) const A3: Bench = Bench {
     about: "hanging strip of 1 m swinging by 5 deg in its first three modes",
     reference: "hanging chain: periods 5.2255, 2.2765, 1.4521 sqrt(L/g)",
     fast: true,
+    reads: Setting::ALL,
     run: modes,
 };
 
@@ -20,6 +21,7 @@ pub(crate) const A4: Bench = Bench {
     about: "stiff panel of 0.3 m as a pendulum from 10, 30 and 90 deg",
     reference: "rigid pendulum: 2 pi sqrt(2L/3g) times 1.0019, 1.0174, 1.1803",
     fast: true,
+    reads: &[Setting::N, Setting::Vertices, Setting::Dt],
     run: panel,
 };
 
@@ -34,7 +36,7 @@ fn j0(x: f64) -> f64 {
 }
 
 fn modes(stage: &mut Stage<'_>) -> Result<(), LabError> {
-    let n = stage.settings.n.unwrap_or(40);
+    let n = stage.edges(40, 4..=200, |n| (across(n) + 1) * (n + 1))?;
     // The tip's way: 5 degrees of the length in the first mode, less in the others.
     let cases = [(0, 0.087, 1.0), (1, 0.02, 3.0), (2, 0.01, 3.0)];
     for (mode, tip, most) in cases {
@@ -44,7 +46,7 @@ fn modes(stage: &mut Stage<'_>) -> Result<(), LabError> {
         let frames = (2.3 * period / f64::from(sim.frame_s)).ceil() as u32;
         let mut crossings = Vec::new();
         let project = |sim: &Sim| -> f64 {
-            let rows = sim.state.positions.chunks(n as usize / 10 + 1).enumerate();
+            let rows = sim.state.positions.chunks(across(n) as usize + 1).enumerate();
             // The mode's weight is even along the strip.
             rows.map(|(j, row)| f64::from(row[0].x) * shape(1.0 - j as f64 / f64::from(n))).sum()
         };
@@ -70,17 +72,27 @@ fn modes(stage: &mut Stage<'_>) -> Result<(), LabError> {
     Ok(())
 }
 
+/// Edges across the strip.
+fn across(n: u32) -> u32 {
+    (n / 10).max(1)
+}
+
 /// A limp strip hanging from y = 0, `offset` (m) off the vertical by height over its lower end.
 fn chain(stage: &mut Stage<'_>, n: u32, offset: impl Fn(f64) -> f64) -> Result<Sim, LabError> {
-    let wide = n / 10;
+    let wide = across(n);
     let mesh = sheet(wide, n, Cut::Alternating, |u, v| Vec3::new(0.0, -v, 0.1 * u))?;
+    // A chain does not stretch: only weight and bending are the fabric's.
+    let plain = Material::default();
+    let (density, bend) =
+        stage.fabric().map_or((plain.density, 1e-9), |f| (f.density, f.bend_mean()));
     let material = Material {
+        density,
         stretch: 5000.0,
         shear: 2500.0,
-        bend: 1e-9,
+        bend,
         drag: 0.0,
         damping_s: 0.0,
-        ..Material::default()
+        ..plain
     };
     let held: Vec<u32> = (0..=wide).collect();
     let model = Model::new(mesh, material, Environment::default(), None, &held)?;
@@ -101,7 +113,7 @@ fn chain(stage: &mut Stage<'_>, n: u32, offset: impl Fn(f64) -> f64) -> Result<S
 }
 
 fn panel(stage: &mut Stage<'_>) -> Result<(), LabError> {
-    let n = stage.settings.n.unwrap_or(12);
+    let n = stage.edges(12, 2..=200, |n| (n + 1) * (n + 1))?;
     let (length, g) = (0.3f32, 9.81f64);
     let small = std::f64::consts::TAU * (2.0 * f64::from(length) / (3.0 * g)).sqrt();
     for (degrees, factor) in [(10.0f32, 1.0019), (30.0, 1.0174), (90.0, 1.1803)] {
