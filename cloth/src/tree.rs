@@ -38,6 +38,10 @@ pub(crate) struct Tree {
     /// Bit k: corner k counts as this slot's; bit 3 + k: the side from corner k to k + 1 does.
     /// Each vertex and each edge belongs to one slot, so that no pair is met twice.
     pub(crate) owns: Vec<u8>,
+    /// The vertices of each slot that count as its own come first, then how many those are.
+    own_vertices: Vec<([u32; 3], u32)>,
+    /// The same of its sides.
+    own_sides: Vec<([[u32; 2]; 3], u32)>,
     /// For each edge of the mesh the vertices of its triangles that it does not have.
     opposites: Vec<[Option<u32>; 2]>,
     /// First slot of each node, and the one after its last.
@@ -148,9 +152,12 @@ impl Tree {
     pub(crate) fn new(mesh: &Mesh) -> Self {
         let (nodes, order) = bvh::split(mesh.rest_positions(), mesh.triangles(), LEAF_TRIANGLES);
         let corners: Vec<[u32; 3]> = order.iter().map(|t| mesh.triangles()[*t as usize]).collect();
+        let owns = owners(mesh, &corners);
         let mut tree = Self {
             across: across(mesh, &corners),
-            owns: owners(mesh, &corners),
+            own_vertices: own(&corners, &owns, 0, |t, k| t[k]),
+            own_sides: own(&corners, &owns, 3, |t, k| [t[k], t[(k + 1) % 3]]),
+            owns,
             opposites: opposites(mesh),
             slots: slots_of(&nodes),
             whole: Vec::new(),
@@ -210,6 +217,20 @@ impl Tree {
             self.first_beside[n + 1] += self.first_beside[n];
         }
         self.beside = pairs.into_iter().map(|[_, b]| b).collect();
+    }
+
+    /// The vertices that belong to a slot.
+    #[inline(always)]
+    pub(crate) fn own_vertices(&self, slot: u32) -> &[u32] {
+        let (all, count) = &self.own_vertices[slot as usize];
+        &all[..*count as usize]
+    }
+
+    /// The sides that belong to a slot.
+    #[inline(always)]
+    pub(crate) fn own_sides(&self, slot: u32) -> &[[u32; 2]] {
+        let (all, count) = &self.own_sides[slot as usize];
+        &all[..*count as usize]
     }
 
     /// The vertices opposite to an edge in its one or two triangles.
@@ -502,6 +523,24 @@ fn owners(mesh: &Mesh, corners: &[[u32; 3]]) -> Vec<u8> {
         bits
     };
     corners.iter().map(own).collect()
+}
+
+/// What belongs to each slot, by bits from `first` on, and how many those are.
+fn own<T: Copy + Default>(
+    corners: &[[u32; 3]],
+    owns: &[u8],
+    first: usize,
+    of: impl Fn(&[u32; 3], usize) -> T,
+) -> Vec<([T; 3], u32)> {
+    let of_slot = |(t, bits): (&[u32; 3], &u8)| {
+        let (mut all, mut count) = ([T::default(); 3], 0);
+        for k in (0..3).filter(|k| bits >> (first + k) & 1 == 1) {
+            all[count] = of(t, k);
+            count += 1;
+        }
+        (all, count as u32)
+    };
+    corners.iter().zip(owns).map(of_slot).collect()
 }
 
 fn opposites(mesh: &Mesh) -> Vec<[Option<u32>; 2]> {

@@ -1,11 +1,11 @@
-//! Eight boxes or triangles side by side: distances of a point to all of them at once.
+//! Eight boxes, triangles or pairs of segments side by side: distances of all of them at once.
 //!
 //! Safe loops over lanes, which [`crate::solver::simd`] compiles for each instruction set; every
 //! lane does the same operations in the same order, so all give the same bits.
 
 use std::ops::{Add, Div, Mul, Sub};
 
-use glam::Vec3A;
+use glam::{Mat4, Vec3A, Vec4};
 
 /// How many lie side by side.
 pub(crate) const WIDE: usize = 8;
@@ -33,6 +33,56 @@ pub(crate) struct Corners([Lanes; 9]);
 
 /// A vector for each lane.
 type Vectors = [Lanes; 3];
+
+/// Vertices and faces, or two edges each, that move: four vertices side by side.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Movers {
+    at: [Vectors; 4],
+    way: [Vectors; 4],
+}
+
+impl Movers {
+    /// All at the origin.
+    pub(crate) const NOWHERE: Self =
+        Self { at: [[Lanes::splat(0.0); 3]; 4], way: [[Lanes::splat(0.0); 3]; 4] };
+
+    /// Sets all lanes, by the four vertices of each, that begin at `at` and go by `way` (m).
+    pub(crate) fn set(&mut self, vertices: &[[u32; 4]; WIDE], at: &[Vec3A], way: &[Vec3A]) {
+        for k in 0..4 {
+            set_lanes(&mut self.at[k], vertices.map(|v| at[v[k] as usize]));
+            set_lanes(&mut self.way[k], vertices.map(|v| way[v[k] as usize]));
+        }
+    }
+
+    /// Bit by bit the lanes in which a vertex and a face, or two edges, may come within `reach` (m) of
+    /// each other: as far as they are apart, less the largest difference of their ways.
+    #[inline(always)]
+    pub(crate) fn may_meet(&self, edges: bool, reach: f32) -> u32 {
+        let ([p, q, r, s], [t, u, v, w]) = (self.at, self.way);
+        let one = apart2(t, v).max(apart2(t, w));
+        let (distance2, relative2) = if edges {
+            let relative2 = one.max(apart2(u, v)).max(apart2(u, w));
+            (segment_distances2([p, q], [r, s]), relative2)
+        } else {
+            (face_distances2([q, r, s], p), one.max(apart2(t, u)))
+        };
+        let most = Lanes::splat(reach) + relative2.sqrt();
+        let most2 = most * most;
+        let doubtless = most2 + (most2 * Lanes::splat(DOUBT.0) + Lanes::splat(DOUBT.1));
+        (distance2 - doubtless).below(0.0)
+    }
+}
+
+fn set_lanes(out: &mut Vectors, of: [Vec3A; WIDE]) {
+    for (half, four) in of.chunks_exact(WIDE / 2).enumerate() {
+        let column = |k: usize| Vec4::from((four[k], 0.0));
+        let rows = Mat4::from_cols(column(0), column(1), column(2), column(3)).transpose();
+        let rows = rows.to_cols_array_2d();
+        for (out, row) in out.iter_mut().zip(rows) {
+            out.0[half * WIDE / 2..][..WIDE / 2].copy_from_slice(&row);
+        }
+    }
+}
 
 impl Lanes {
     /// The same for all.
@@ -63,6 +113,12 @@ impl Lanes {
     pub(crate) fn choose_over(self, value: f32, yes: Self, no: Self) -> Self {
         let of = |lane: usize| if self.0[lane] > value { yes.0[lane] } else { no.0[lane] };
         Self(std::array::from_fn(of))
+    }
+
+    /// The square root.
+    #[inline(always)]
+    pub(crate) fn sqrt(self) -> Self {
+        Self(std::array::from_fn(|lane| self.0[lane].sqrt()))
     }
 
     /// Bit by bit the lanes that are less than `value`.
@@ -156,8 +212,13 @@ pub(crate) fn box_distances2(boxes: &Boxes, point: Vec3A) -> Lanes {
 #[inline(always)]
 pub(crate) fn triangle_distances2(corners: &Corners, point: Vec3A) -> Lanes {
     let c = &corners.0;
-    let (a, b, c) = ([c[0], c[1], c[2]], [c[3], c[4], c[5]], [c[6], c[7], c[8]]);
-    let p = [point.x, point.y, point.z].map(Lanes::splat);
+    let corners = [[c[0], c[1], c[2]], [c[3], c[4], c[5]], [c[6], c[7], c[8]]];
+    face_distances2(corners, [point.x, point.y, point.z].map(Lanes::splat))
+}
+
+/// As [`triangle_distances2`], of a point of its own for each triangle.
+#[inline(always)]
+fn face_distances2([a, b, c]: [Vectors; 3], p: Vectors) -> Lanes {
     let (ab, ac, bc) = (minus(b, a), minus(c, a), minus(c, b));
     let (ap, bp) = (minus(p, a), minus(p, b));
     let (ab2, ac2, both) = (dot(ab, ab), dot(ac, ac), dot(ab, ac));
@@ -178,6 +239,38 @@ pub(crate) fn triangle_distances2(corners: &Corners, point: Vec3A) -> Lanes {
     inside.choose_over(0.0, to_plane, to_sides)
 }
 
+/// Squared distances of pairs of segments (m^2), by the steps of [`crate::segment::closest`].
+#[inline(always)]
+fn segment_distances2([p, q]: [Vectors; 2], [r, s]: [Vectors; 2]) -> Lanes {
+    let least = Lanes::splat(f32::MIN_POSITIVE);
+    let (d1, d2, to) = (minus(q, p), minus(s, r), minus(p, r));
+    let (a, e, f) = (dot(d1, d1).max(least), dot(d2, d2).max(least), dot(d2, to));
+    let (b, c) = (dot(d1, d2), dot(d1, to));
+    let determinant = a * e - b * b;
+    let across = determinant - Lanes::splat(SLIVER) * (a * e);
+    let start = share(b * f - c * e, determinant.max(least));
+    let start = across.choose_over(0.0, start, Lanes::splat(0.5));
+    let t = share(b * start + f, e);
+    let s = share(b * t - c, a);
+    let t = share(b * s + f, e);
+    let (x, y, z) = (to[0] + d1[0] * s, to[1] + d1[1] * s, to[2] + d1[2] * s);
+    let rest = [x - d2[0] * t, y - d2[1] * t, z - d2[2] * t];
+    dot(rest, rest)
+}
+
+/// `part / whole`, within 0..=1.
+#[inline(always)]
+fn share(part: Lanes, whole: Lanes) -> Lanes {
+    (part / whole).max(Lanes::splat(0.0)).min(Lanes::splat(1.0))
+}
+
+/// Squared lengths of the differences (m^2).
+#[inline(always)]
+fn apart2(a: Vectors, b: Vectors) -> Lanes {
+    let way = minus(a, b);
+    dot(way, way)
+}
+
 /// Whether a triangle at about `distance2` may be nearer than `best` (m^2).
 #[inline(always)]
 pub(crate) fn may_be_nearer(distance2: f32, best: f32) -> bool {
@@ -187,8 +280,7 @@ pub(crate) fn may_be_nearer(distance2: f32, best: f32) -> bool {
 /// Squared distance to the side `along` from its beginning's way `to` to the point.
 #[inline(always)]
 fn to_side(to: Vectors, along: Vectors, part: Lanes, whole: Lanes) -> Lanes {
-    let t = part / whole.max(Lanes::splat(f32::MIN_POSITIVE));
-    let t = t.max(Lanes::splat(0.0)).min(Lanes::splat(1.0));
+    let t = share(part, whole.max(Lanes::splat(f32::MIN_POSITIVE)));
     let rest = [to[0] - along[0] * t, to[1] - along[1] * t, to[2] - along[2] * t];
     dot(rest, rest)
 }

@@ -9,7 +9,7 @@ use glam::{Vec3A, Vec4};
 
 use super::matrix::{Matrix, Pattern};
 use crate::tree::Leaf;
-use crate::wide::{self, Boxes, Lanes};
+use crate::wide::{self, Boxes, Lanes, Movers};
 
 /// Something to be done whose body is compiled for the best instruction set of this CPU.
 /// Implementations mark `run` and all that it calls `#[inline(always)]`.
@@ -158,6 +158,34 @@ pub(crate) fn box_distances2(set: Set, boxes: &Boxes, point: Vec3A) -> Lanes {
 #[inline(never)]
 fn box_distances2_avx2(boxes: &Boxes, point: Vec3A) -> Lanes {
     wide::box_distances2(boxes, point)
+}
+
+/// [`Movers::may_meet`], compiled by itself, too.
+#[inline(always)]
+pub(crate) fn may_meet(set: Set, movers: &Movers, edges: bool, reach: f32) -> u32 {
+    match set {
+        Set::Baseline => movers.may_meet(edges, reach),
+        // SAFETY: sets come from `detect`; the body is safe code.
+        #[cfg(target_arch = "x86_64")]
+        _ if edges => unsafe { edges_may_meet_avx2(movers, reach) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        _ => unsafe { faces_may_meet_avx2(movers, reach) },
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+#[inline(never)]
+fn edges_may_meet_avx2(movers: &Movers, reach: f32) -> u32 {
+    movers.may_meet(true, reach)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+#[inline(never)]
+fn faces_may_meet_avx2(movers: &Movers, reach: f32) -> u32 {
+    movers.may_meet(false, reach)
 }
 
 /// A row's blocks are read in order, each as three vectors of which the fourth lane is the next

@@ -4,12 +4,15 @@ use glam::Vec3A;
 
 use super::SelfContact;
 use super::pair::{Closest, Pair};
+use super::sieve::{Candidate, EDGES, Sieve};
 use crate::model::Model;
 use crate::tree::{Fit, Tree};
 
 /// Share of a pair's distance in the rest shape at which it repels at most: parts of a smooth cloth
 /// are no contact.
 const REST_SHARE: f32 = 0.5;
+/// Boxes that are this many times as far apart as matters are so beyond any rounding.
+const FAR: f32 = 1.01;
 /// An outer layer is on the wrong side where the cosine between the way to it and the inner one's
 /// normal is less than this: what lies beside a rim is on neither.
 const WRONG_SIDE: f32 = -0.3;
@@ -20,6 +23,8 @@ impl SelfContact {
         self.listed.clear();
         self.listed.extend_from_slice(way);
         self.pairs.clear();
+        self.strayed.clear();
+        self.strayed.resize(x.len(), true);
         self.list(model, x, false);
     }
 
@@ -40,24 +45,30 @@ impl SelfContact {
         let (tree, reach) = (&model.tree, Self::reach(model));
         let mut pairs = std::mem::take(&mut self.pairs);
         let mut fit = std::mem::take(&mut self.fit);
+        let mut sieve = std::mem::take(&mut self.sieve);
+        sieve.clear();
         let way = &self.listed;
         tree.fit(|v| x[v as usize], |v| way[v as usize], &mut fit);
         if strayed {
             tree.restrict(&self.strayed, &mut fit);
         }
         let old = pairs.len();
-        let search = Search { model, tree, x, way, reach };
+        let search = Search { model, tree, x, way, among: &self.strayed, reach };
         tree.pairs(&mut fit, reach, true, |fit, i, j| {
-            search.faces(fit, i, j, &mut pairs);
-            search.faces(fit, j, i, &mut pairs);
-            search.edges(fit, i, j, &mut pairs);
+            search.faces(i, j, &mut sieve);
+            search.faces(j, i, &mut sieve);
+            search.edges(i, j, &mut sieve);
+            if sieve.is_full() {
+                search.sift(fit, &mut sieve, &mut pairs);
+            }
         });
+        search.sift(&fit, &mut sieve, &mut pairs);
         self.fit = fit;
+        self.sieve = sieve;
         let mut place = 0;
         pairs.retain(|p| {
             place += 1;
-            let wanted = !strayed || p.vertices.iter().any(|v| self.strayed[*v as usize]);
-            place <= old || wanted && !self.may_pass(p)
+            place <= old || !self.may_pass(p)
         });
         self.pairs = pairs;
     }
@@ -68,57 +79,69 @@ struct Search<'a> {
     tree: &'a Tree,
     x: &'a [Vec3A],
     way: &'a [Vec3A],
+    /// The vertices of which a pair must have one.
+    among: &'a [bool],
     reach: f32,
 }
 
 impl Search<'_> {
     /// The vertices that belong to slot `of` against the face of slot `against`.
-    fn faces(&self, fit: &Fit, of: u32, against: u32, out: &mut Vec<Pair>) {
-        let normal = fit.normals[against as usize][0];
+    #[inline(always)]
+    fn faces(&self, of: u32, against: u32, out: &mut Sieve) {
         let face = self.tree.corners[against as usize];
-        let owns = self.tree.owns[of as usize];
-        for (k, v) in self.tree.corners[of as usize].into_iter().enumerate() {
-            if owns >> k & 1 == 0 || face.contains(&v) {
-                continue;
-            }
+        let among = self.is_among(face[0]) | self.is_among(face[1]) | self.is_among(face[2]);
+        for v in self.tree.own_vertices(of).iter().copied() {
+            let apart = (v != face[0]) & (v != face[1]) & (v != face[2]);
             let vertices = [v, face[0], face[1], face[2]];
-            let (p, way) = (self.x[v as usize], self.way[v as usize]);
-            let apart = |f: u32| (way - self.way[f as usize]).length_squared();
-            let relative = apart(face[0]).max(apart(face[1])).max(apart(face[2])).sqrt();
-            let most = self.reach + relative;
-            if normal.dot(p - self.x[face[0] as usize]).abs() <= most {
-                self.add(fit, vertices, false, most, out);
-            }
+            out.push(apart & (among | self.is_among(v)), Candidate { vertices, face: against });
         }
     }
 
     /// The edges that belong to one slot against those that belong to the other.
-    fn edges(&self, fit: &Fit, i: u32, j: u32, out: &mut Vec<Pair>) {
-        let sides = |slot: u32| {
-            let (corners, owns) = (self.tree.corners[slot as usize], self.tree.owns[slot as usize]);
-            (0..3usize)
-                .filter(move |k| owns >> (3 + k) & 1 == 1)
-                .map(move |k| [corners[k], corners[(k + 1) % 3]])
-        };
-        let way = |v: u32| self.way[v as usize];
-        let at = |v: u32| self.x[v as usize];
-        for a in sides(i) {
-            for b in sides(j) {
-                if a.iter().any(|v| b.contains(v)) {
-                    continue;
-                }
-                let apart = |u: u32, v: u32| (way(u) - way(v)).length_squared();
-                let one = apart(a[0], b[0]).max(apart(a[0], b[1]));
-                let relative = one.max(apart(a[1], b[0])).max(apart(a[1], b[1])).sqrt();
-                let most = self.reach + relative;
-                let (p, q) = (a.map(at), b.map(at));
-                let below = p[0].min(p[1]) - q[0].max(q[1]);
-                let above = q[0].min(q[1]) - p[0].max(p[1]);
-                if below.max(above).max_element() > most {
-                    continue;
-                }
-                self.add(fit, [a[0], a[1], b[0], b[1]], true, most, out);
+    #[inline(always)]
+    fn edges(&self, i: u32, j: u32, out: &mut Sieve) {
+        for [a, b] in self.tree.own_sides(i) {
+            let among = self.is_among(*a) | self.is_among(*b);
+            for [c, d] in self.tree.own_sides(j) {
+                let apart = (a != c) & (a != d) & (b != c) & (b != d);
+                let wanted = apart & (among | self.is_among(*c) | self.is_among(*d));
+                out.push(wanted, Candidate { vertices: [*a, *b, *c, *d], face: EDGES });
             }
+        }
+    }
+
+    #[inline(always)]
+    fn is_among(&self, vertex: u32) -> bool {
+        self.among[vertex as usize]
+    }
+
+    /// Lists those of the candidates that are near, in their order, and forgets all.
+    fn sift(&self, fit: &Fit, sieve: &mut Sieve, out: &mut Vec<Pair>) {
+        sieve.look(self.x, self.way, self.reach);
+        for candidate in sieve.near() {
+            self.measure(fit, candidate, out);
+        }
+        sieve.clear();
+    }
+
+    fn measure(&self, fit: &Fit, Candidate { vertices, face }: Candidate, out: &mut Vec<Pair>) {
+        let [a, b, c, d] = vertices;
+        let apart = |u: u32, v: u32| (self.way[u as usize] - self.way[v as usize]).length_squared();
+        let one = apart(a, c).max(apart(a, d));
+        if face != EDGES {
+            let most = self.reach + apart(a, b).max(one).sqrt();
+            let normal = fit.normals[face as usize][0];
+            if normal.dot(self.x[a as usize] - self.x[b as usize]).abs() <= most {
+                self.add(fit, vertices, false, most, out);
+            }
+            return;
+        }
+        let most = self.reach + one.max(apart(b, c)).max(apart(b, d)).sqrt();
+        let at = |v: u32| self.x[v as usize];
+        let below = at(a).min(at(b)) - at(c).max(at(d));
+        let above = at(c).min(at(d)) - at(a).max(at(b));
+        if below.max(above).max_element() <= most {
+            self.add(fit, vertices, true, most, out);
         }
     }
 
@@ -129,12 +152,28 @@ impl Search<'_> {
         if distance > most || distance <= f32::MIN_POSITIVE {
             return;
         }
-        let rest = self.model.mesh.rest_positions();
-        let rest = Closest::of(edges, &vertices.map(|v| Vec3A::from(rest[v as usize])));
-        let keep = self.model.material.offset.min(REST_SHARE * rest.across.length());
+        let keep = self.keep(edges, &vertices);
         let normal = c.across / distance;
         let wrong = distance <= self.reach && self.is_wrong(fit, &vertices, edges, normal);
         out.push(Pair { vertices, edges, normal, distance, keep, wrong });
+    }
+
+    /// Distance at which a pair begins to repel (m): the offset, or less for what is near in the rest shape.
+    fn keep(&self, edges: bool, vertices: &[u32; 4]) -> f32 {
+        let (rest, offset) = (self.model.mesh.rest_positions(), self.model.material.offset);
+        let [a, b, c, d] = vertices.map(|v| Vec3A::from(rest[v as usize]));
+        // Boxes that are far apart need no closer look.
+        let (first, second) = if edges {
+            ([a.min(b), a.max(b)], [c.min(d), c.max(d)])
+        } else {
+            ([a, a], [b.min(c).min(d), b.max(c).max(d)])
+        };
+        let gap = (second[0] - first[1]).max(first[0] - second[1]).max_element();
+        if REST_SHARE * gap > FAR * offset {
+            return offset;
+        }
+        let rest = Closest::of(edges, &[a, b, c, d]);
+        offset.min(REST_SHARE * rest.across.length())
     }
 
     /// Whether the outer one of two layers lies inside the inner one.

@@ -28,6 +28,7 @@ mod bound;
 mod find;
 pub(crate) mod pair;
 mod row;
+mod sieve;
 mod untangle;
 
 use glam::{Vec3, Vec3A};
@@ -37,6 +38,7 @@ use crate::model::Model;
 use crate::tree::Fit;
 use pair::Pair;
 pub(crate) use row::{Pass, Rows};
+use sieve::Sieve;
 
 /// Pairs are listed this much beyond the distance at which they act (m).
 const MARGIN_M: f32 = 0.002;
@@ -47,6 +49,7 @@ const FLOOR_M: f32 = 2.5e-4;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct SelfContact {
     fit: Fit,
+    sieve: Sieve,
     pub(crate) pairs: Vec<Pair>,
     /// Vertices of edges and triangles that cut each other.
     off: Vec<bool>,
