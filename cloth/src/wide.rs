@@ -323,6 +323,47 @@ mod tests {
     }
 
     #[test]
+    fn lanes_let_pass_whatever_comes_within_reach_and_little_else() {
+        let mut chance = Chance::new(5);
+        let (mut passed, mut wanted) = ([0, 0], [0, 0]);
+        for round in 0..4000 {
+            let mut by_chance =
+                |most: f32| Vec3A::from_array(std::array::from_fn(|_| most * chance.signed()));
+            let mut at: [Vec3A; 4] = std::array::from_fn(|_| by_chance(1.0));
+            if round % 5 == 0 {
+                at[3] = at[2] + (at[1] - at[0]) * 0.7; // parallel edges, or a face like a needle
+            }
+            let way: [Vec3A; 4] = std::array::from_fn(|_| by_chance(0.1));
+            let mut movers = Movers::NOWHERE;
+            movers.set(&[[0, 1, 2, 3]; WIDE], &at, &way);
+            let reach = 0.2;
+            for edges in [false, true] {
+                let (distance, second) = if edges {
+                    let (s, t) = crate::segment::closest([at[0], at[1]], [at[2], at[3]]);
+                    (at[0].lerp(at[1], s).distance(at[2].lerp(at[3], t)), 2)
+                } else {
+                    let face = [at[1], at[2], at[3]];
+                    (triangle::closest(&face, at[0]).point.distance(at[0]), 1)
+                };
+                let mut relative = 0.0f32;
+                for a in &way[..second] {
+                    relative = way[second..].iter().fold(relative, |r, b| r.max(a.distance(*b)));
+                }
+                let near = movers.may_meet(edges, reach);
+                assert!(near == 0 || near == 0xff);
+                if distance <= reach + relative {
+                    wanted[usize::from(edges)] += 1;
+                    assert!(near != 0, "{distance} within {reach} and {relative}");
+                }
+                passed[usize::from(edges)] += usize::from(near != 0);
+            }
+        }
+        for (passed, wanted) in passed.into_iter().zip(wanted) {
+            assert!(wanted > 400 && passed < wanted + wanted / 50, "{passed} for {wanted}");
+        }
+    }
+
+    #[test]
     fn an_empty_lane_is_far_from_everything() {
         let mut boxes = Boxes::NOWHERE;
         boxes.set(3, &[Vec3A::ZERO, Vec3A::ONE]);

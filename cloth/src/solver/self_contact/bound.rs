@@ -27,6 +27,14 @@ pub(crate) struct Zones {
     ways: Vec<(Vec3A, f32)>,
 }
 
+/// When pairs were looked at, and when vertices moved.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Moves {
+    moved: Vec<u32>,
+    checked: Vec<u32>,
+    before: Vec<Vec3A>,
+}
+
 /// What the bound did.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Bounded {
@@ -79,18 +87,41 @@ impl SelfContact {
     }
 
     /// Gauss-Seidel over the pairs that would meet, in turn with the edges that this stretches too
-    /// far; returns whether none of either is left.
+    /// far; returns whether none of either is left. After the first sweep only those pairs are
+    /// looked at of which a vertex has moved since.
     fn push_apart(
-        &self,
+        &mut self,
         model: &Model,
         x: &[Vec3A],
         inverse_masses: &[f32],
         ends: &mut [Vec3A],
         done: &mut Bounded,
     ) -> bool {
+        let Moves { moved, checked, before } = &mut self.moves;
+        moved.clear();
+        moved.resize(ends.len(), 0);
+        checked.clear();
+        checked.resize(self.pairs.len(), 0);
+        // Counts what was looked at; 0 is before all.
+        let mut now = 1u32;
         for _ in 0..SWEEPS {
-            let mut clear = !done.moved || limit::settle(&model.mesh, inverse_masses, ends);
-            for pair in self.pairs.iter().filter(|p| !p.wrong) {
+            let mut clear = true;
+            if done.moved {
+                before.clear();
+                before.extend_from_slice(ends);
+                clear = limit::settle(&model.mesh, inverse_masses, ends);
+                now += 1;
+                let changed = ends.iter().zip(before.iter()).map(|(now, then)| now != then);
+                moved.iter_mut().zip(changed).filter(|(_, c)| *c).for_each(|(at, _)| *at = now);
+            }
+            for (pair, checked) in self.pairs.iter().zip(checked.iter_mut()) {
+                let known =
+                    *checked > 0 && pair.vertices.iter().all(|v| moved[*v as usize] < *checked);
+                if pair.wrong || known {
+                    continue;
+                }
+                now += 1;
+                *checked = now;
                 let from = x[pair.vertices[0] as usize];
                 let (a, b) = (pair.gather(from, x), pair.gather(from, ends));
                 let floor = pair.floor();
@@ -98,6 +129,7 @@ impl SelfContact {
                     continue;
                 }
                 clear = false;
+                *checked = 0;
                 let (shares, normal) = pair.side_of_meeting(&a, &b);
                 let missing = GENEROUS * floor - normal.dot(mix(&shares, &b));
                 let weight = |k: usize| inverse_masses[pair.vertices[k] as usize];
@@ -106,6 +138,7 @@ impl SelfContact {
                     for k in 0..4 {
                         let push = normal * (shares[k] * weight(k) * missing / sum);
                         ends[pair.vertices[k] as usize] += push;
+                        moved[pair.vertices[k] as usize] = now;
                     }
                     done.moved = true;
                 }

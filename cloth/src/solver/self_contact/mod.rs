@@ -61,6 +61,7 @@ pub(crate) struct SelfContact {
     crossings: Vec<Crossing>,
     shifts: Vec<(Vec3A, f32)>,
     zones: bound::Zones,
+    moves: bound::Moves,
 }
 
 impl SelfContact {
