@@ -17,6 +17,11 @@ use crate::recall::Named;
 use crate::store::Opened;
 use crate::{args, format, place, scene, store};
 
+/// Frames from which on what they cost is worth another forecast.
+const JUDGED_FRAMES: u64 = 100;
+/// A forecast is told again when frames cost this many times as much, or as little, as was told.
+const NEWS: f64 = 1.5;
+
 /// Explores until told otherwise.
 pub fn run(a: args::Explore) -> Result<()> {
     if let Some(error) = a.error {
@@ -44,14 +49,14 @@ pub fn run(a: args::Explore) -> Result<()> {
     };
     let otherwise_ended = a.error.is_some() || a.time.is_some();
     let mut live = Live::new(a.frames);
-    let mut told = false;
+    let mut told = None;
     let mut version = None;
     let summary = explore_blocking(&scene, &named, &opened, &work, &options, &mut |progress| {
         if let Some(failure) = &progress.failure {
             live.note(&format!("a job was given up: {failure}"));
         }
-        if !told && progress.phase != Phase::Drape {
-            told = true;
+        if progress.phase != Phase::Drape && is_news(told, progress) {
+            told = Some(progress.cost.cpu_s);
             live.note(&forecast(progress, a.frames, otherwise_ended));
         }
         if progress.version != version {
@@ -108,6 +113,15 @@ pub fn explore_blocking(
     Ok(summary)
 }
 
+/// Whether a frame costs so much more or less than was told that the forecast should be told again. Calm
+/// motion comes first: crumpled cloth costs ten times as much.
+fn is_news(told: Option<f64>, p: &Progress) -> bool {
+    told.is_none_or(|told| {
+        let ratio = p.cost.cpu_s / told;
+        p.simulated_frames >= JUDGED_FRAMES && !(1.0 / NEWS..=NEWS).contains(&ratio)
+    })
+}
+
 /// What the run will cost, by what a frame cost so far.
 fn forecast(p: &Progress, frames: Option<u64>, otherwise_ended: bool) -> String {
     // The initial pass is made whole, however few frames are asked for.
@@ -127,8 +141,12 @@ fn forecast(p: &Progress, frames: Option<u64>, otherwise_ended: bool) -> String 
         s if s < 600.0 => format!("{s:.0} CPU s"),
         s => format!("{:.1} CPU h", s / 3600.0),
     };
+    let judged = match p.simulated_frames {
+        0 => "still cloth",
+        _ => "the frames so far",
+    };
     format!(
-        "{what}about {cpu} and {} in the work folder{free}",
+        "{what}by {judged} about {cpu} and {} in the work folder{free}",
         format::bytes(left * p.cost.work_bytes)
     )
 }
