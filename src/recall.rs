@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, ensure};
-use explorer::grow::archive::Archive;
+use anyhow::{Context, Result, anyhow, ensure};
+use explorer::explore::OLDER;
+use explorer::grow::archive::{Archive, ArchiveError};
 use explorer::scene::Scene;
 use serde::{Deserialize, Serialize};
 
@@ -61,8 +62,8 @@ pub fn recall(opened: &Opened, a: &args::Explored) -> Result<Explored> {
     let work = place::work(opened, a.work.clone())?;
     ensure!(
         work.join("journal").is_file(),
-        "there is no work folder {}: certificates, plots and comparisons need the exact states of \
-         the explorer; name it with --work",
+        "nothing was explored in {}: certificates, plots and comparisons need the exact states of \
+         the explorer; name its work folder with --work, or explore first",
         work.display()
     );
     let left = || {
@@ -76,6 +77,12 @@ pub fn recall(opened: &Opened, a: &args::Explored) -> Result<Explored> {
         })?,
     };
     let scene = scene::load_with(&named.scene, named.vertices)?;
-    let archive = Archive::open(&work, &scene)?;
+    let archive = Archive::open(&work, &scene).map_err(|error| match error {
+        ArchiveError::Records { .. } => anyhow!("{error}{OLDER}"),
+        ArchiveError::Journal { .. } | ArchiveError::States { .. } => {
+            anyhow!("{error}; restore a copy of the work folder, or name another (--work)")
+        }
+        other => other.into(),
+    })?;
     Ok(Explored { scene, work, archive })
 }

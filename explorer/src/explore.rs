@@ -33,6 +33,8 @@ mod physics;
 #[path = "explore_report.rs"]
 mod report;
 
+pub use physics::OLDER;
+use physics::older;
 use report::Run;
 pub use report::{ClassCount, End, FrameCost, Progress, Summary};
 
@@ -104,7 +106,7 @@ impl Default for ExploreOptions {
 #[non_exhaustive]
 pub enum ExploreError {
     /// The work folder.
-    #[error("the work folder: {0}")]
+    #[error("the work folder: {0}{older}", older = older(.0))]
     Work(#[from] WorkError),
     /// A round of jobs.
     #[error("exploring: {0}")]

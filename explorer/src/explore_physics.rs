@@ -1,9 +1,18 @@
-//! Whether the simulator is the one that made a work folder.
+//! Whether the simulator is the one that made a work folder, and the program one that chose alike.
 
 use super::{ExploreError, Setup};
 use crate::grow::round::RoundError;
-use crate::grow::work::Work;
+use crate::grow::work::{Work, WorkError};
 use crate::simulator::Simulator;
+
+/// Why records may contradict each other that nothing has damaged.
+pub const OLDER: &str = "; where nothing has damaged it, an older toile wrote it, which chose the dead \
+    ends to simulate otherwise: go on with that one, or begin anew in another work folder and store";
+
+/// What to say beside an error of a work folder.
+pub(super) fn older(error: &WorkError) -> &'static str {
+    if matches!(error, WorkError::Records { .. }) { OLDER } else { "" }
+}
 
 /// A folder goes on only under the physics that made it: its first frame is simulated once more.
 pub(super) fn check(

@@ -57,3 +57,14 @@ fn a_drape_can_be_stopped_and_made_later() {
     let summary = explore(&scene, &toy, (folder.path(), &mut store), &options(60)).unwrap();
     assert_eq!(summary.end, End::Frames);
 }
+
+/// Records that contradict each other need not be damaged: policies have chosen otherwise before.
+#[test]
+fn a_folder_of_an_older_toile_is_refused_with_what_to_do() {
+    let source = crate::grow::ledger::LedgerError::OutOfTurn("a job");
+    let error = crate::grow::work::WorkError::Records { path: "w/journal".into(), source };
+    let said = ExploreError::from(error).to_string();
+    let words =
+        ["w/journal", "a job is out of turn", "restore a copy", "older toile", "begin anew"];
+    assert!(words.iter().all(|word| said.contains(word)), "{said}");
+}

@@ -29,7 +29,9 @@ pub enum DecodeError {
         found: Vec<u8>,
     },
     /// Written by another version of the format.
-    #[error("{what}: format version {found}, but only {known} is known; update this program")]
+    #[error(
+        "{what}: format version {found}, but only {known} is known; {} program", which(*.found, *.known)
+    )]
     UnknownVersion {
         /// The type.
         what: &'static str,
@@ -62,6 +64,11 @@ pub enum DecodeError {
         /// What is wrong, and where.
         why: String,
     },
+}
+
+/// What to do about a format version.
+fn which(found: u16, known: u16) -> &'static str {
+    if found > known { "update this" } else { "make it anew: it is of an older" }
 }
 
 /// A type's envelope.

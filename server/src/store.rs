@@ -1,6 +1,7 @@
 //! Reading the store: head, manifests, chunks. Nothing is served that is not what its name says.
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
@@ -130,16 +131,35 @@ impl Source {
     /// Creates a tag under the next free number and says which; `None` where others took all that
     /// were tried.
     pub async fn add_tag(&self, bytes: &[u8]) -> Result<Option<u64>, ReadError> {
-        self.add(&self.tags, bytes).await
+        self.add(&self.tags, bytes, &AtomicU64::new(0)).await
     }
 
-    /// Creates a batch of telemetry, as [`Source::add_tag`].
-    pub async fn add_telemetry(&self, bytes: &[u8]) -> Result<Option<u64>, ReadError> {
-        self.add(&self.telemetry, bytes).await
+    /// Creates a batch of telemetry, as [`Source::add_tag`]. Where this fails or is dropped, `tried` is
+    /// the number under which the store may have it all the same, or 0.
+    pub async fn add_telemetry(
+        &self,
+        bytes: &[u8],
+        tried: &AtomicU64,
+    ) -> Result<Option<u64>, ReadError> {
+        self.add(&self.telemetry, bytes, tried).await
+    }
+
+    /// Puts a batch under the number where the store may have it already; says whether it is there.
+    pub async fn settle_telemetry(&self, number: u64, bytes: &[u8]) -> Result<bool, ReadError> {
+        let path = store::telemetry_path(number);
+        if self.create(path.clone(), bytes.to_vec()).await? {
+            return Ok(true);
+        }
+        Ok(self.read(&path).await?.is_some_and(|found| found[..] == *bytes))
     }
 
     /// Lists the folder once, then only what was added by others since: a world runs for years.
-    async fn add(&self, numbers: &Numbers, bytes: &[u8]) -> Result<Option<u64>, ReadError> {
+    async fn add(
+        &self,
+        numbers: &Numbers,
+        bytes: &[u8],
+        tried: &AtomicU64,
+    ) -> Result<Option<u64>, ReadError> {
         let mut newest = numbers.newest.lock().await;
         for _ in 0..TRIES {
             let after = match *newest {
@@ -149,11 +169,13 @@ impl Source {
             let next = after + 1;
             // Not known unless all goes well: a number must neither be left out nor taken twice.
             *newest = None;
+            tried.store(next, Ordering::Relaxed);
             if self.create((numbers.path)(next), bytes.to_vec()).await? {
                 *newest = Some(next);
                 return Ok(Some(next));
             }
             // Another server of this store was faster.
+            tried.store(0, Ordering::Relaxed);
             *newest = Some(self.newest_after(numbers, next).await?);
         }
         Ok(None)

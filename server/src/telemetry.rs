@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
+use std::sync::atomic::AtomicU64;
 use std::time::Duration;
 
 use protocol::message::Telemetry;
@@ -18,6 +19,8 @@ pub(crate) struct Counts {
     players: BTreeMap<u64, Edges>,
     /// Weighed already, but refused by the store.
     kept: Edges,
+    /// Batches that the store may have under these numbers, though it did not say so.
+    unsure: Vec<(u64, TelemetryBatch)>,
 }
 
 impl Counts {
@@ -99,18 +102,31 @@ pub(crate) async fn keep_writing(shared: &Shared, interval: Duration) {
 }
 
 /// Writes what was counted, if anything, under the next free number. What the store refuses, or does
-/// not take before this is dropped, is kept for the next time.
+/// not take before this is dropped, is kept for the next time. A batch that the store may have taken
+/// without saying so is first put under the same number again, so that it counts once.
 pub(crate) async fn write(shared: &Shared) {
+    let failed = |error| {
+        tracing::warn!(%error, "telemetry is kept for later");
+        shared.metrics.store_failures.inc();
+    };
+    loop {
+        let Some((number, batch)) = lock(&shared.counts).unsure.pop() else { break };
+        let bytes = batch.encode();
+        let mut taken = Taken::new(&shared.counts, batch, number);
+        match shared.source.settle_telemetry(number, &bytes).await {
+            Ok(true) => taken.batch = None,
+            // Another server has the number: the store never took it from this one.
+            Ok(false) => taken.tried = AtomicU64::new(0),
+            Err(error) => return failed(error),
+        }
+    }
     let Some(batch) = lock(&shared.counts).take() else { return };
     let bytes = batch.encode();
-    let mut taken = Taken { counts: &shared.counts, batch: Some(batch) };
-    match shared.source.add_telemetry(&bytes).await {
+    let mut taken = Taken::new(&shared.counts, batch, 0);
+    match shared.source.add_telemetry(&bytes, &taken.tried).await {
         Ok(Some(_)) => taken.batch = None,
         Ok(None) => tracing::warn!("telemetry is kept for later: others took every number tried"),
-        Err(error) => {
-            tracing::warn!(%error, "telemetry is kept for later");
-            shared.metrics.store_failures.inc();
-        }
+        Err(error) => failed(error),
     }
 }
 
@@ -118,12 +134,22 @@ pub(crate) async fn write(shared: &Shared) {
 struct Taken<'a> {
     counts: &'a Mutex<Counts>,
     batch: Option<TelemetryBatch>,
+    /// The number under which the store may have it; 0 for none.
+    tried: AtomicU64,
+}
+
+impl<'a> Taken<'a> {
+    fn new(counts: &'a Mutex<Counts>, batch: TelemetryBatch, tried: u64) -> Self {
+        Self { counts, batch: Some(batch), tried: AtomicU64::new(tried) }
+    }
 }
 
 impl Drop for Taken<'_> {
     fn drop(&mut self) {
-        if let Some(batch) = self.batch.take() {
-            lock(self.counts).put_back(batch);
+        let Some(batch) = self.batch.take() else { return };
+        match *self.tried.get_mut() {
+            0 => lock(self.counts).put_back(batch),
+            number => lock(self.counts).unsure.push((number, batch)),
         }
     }
 }
@@ -167,12 +193,16 @@ mod tests {
         for _ in 0..3 {
             let batch = lock(&counts).take();
             assert_eq!(batch.as_ref().unwrap().garments[0].edges, [(EdgeId(0), 7)]);
-            drop(Taken { counts: &counts, batch });
+            drop(Taken::new(&counts, batch.unwrap(), 0));
         }
-        let batch = lock(&counts).take();
-        let mut taken = Taken { counts: &counts, batch };
+        // What the store may have is kept apart: it is not counted again with what comes next.
+        let batch = lock(&counts).take().unwrap();
+        drop(Taken::new(&counts, batch.clone(), 4));
+        assert_eq!(lock(&counts).take(), None);
+        assert_eq!(lock(&counts).unsure.pop(), Some((4, batch.clone())));
+        let mut taken = Taken::new(&counts, batch, 0);
         taken.batch = None;
         drop(taken);
-        assert_eq!(lock(&counts).take(), None);
+        assert!(lock(&counts).take().is_none() && lock(&counts).unsure.is_empty());
     }
 }

@@ -11,8 +11,8 @@ use serde::Serialize;
 use super::components::Digraph;
 use super::garment::GarmentError;
 use super::motion_graph::GraphReport;
-use super::reach::Reach;
-use super::{Loaded, SceneError};
+use super::reach::{ClipReach, Reach};
+use super::{AskedReach, Loaded, SceneError};
 use crate::primary::PrimaryGraph;
 
 /// A garment vertex may be this deep inside the body in the rest pose (m).
@@ -43,8 +43,12 @@ pub struct SceneReport {
     pub outside: Vec<super::motion_graph::FrameRange>,
     /// Dead ends of a breadth-first walk over every edge: edges - poses + 1.
     pub initial_dead_ends: usize,
-    /// Median and 90th percentile time to reach a given clip.
+    /// Median, 90th percentile and worst time to reach a given clip.
     pub reach: Reach,
+    /// The same of each clip.
+    pub reach_by_clip: Vec<ClipReach>,
+    /// What the scene asks for by `reach_s`, and what it got.
+    pub reach_asked: Option<ReachAsked>,
     /// Clips of which the graph has no pose.
     pub unreached: Vec<String>,
     /// Vertices of the body.
@@ -63,6 +67,20 @@ pub struct SceneReport {
     pub attached: usize,
     /// Lowest and highest vertex that the body carries, in the rest pose (m).
     pub attached_height_m: Option<[f32; 2]>,
+}
+
+/// What a scene asks of its motion graph, and what it got.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ReachAsked {
+    /// Median time that it asks for (s).
+    pub asked_s: f32,
+    /// Among these clips.
+    pub clips: Vec<String>,
+    /// The times among them.
+    #[serde(flatten)]
+    pub reach: Reach,
+    /// Whether the median is at most what was asked for.
+    pub met: bool,
 }
 
 /// A garment's mesh, measured in the rest pose.
@@ -96,7 +114,7 @@ pub fn check_scene(name_or_path: &str, data_dir: Option<&Path>) -> Result<SceneR
 /// # Errors
 /// A garment that [`check_garment`] refuses.
 pub fn report(loaded: &Loaded) -> Result<SceneReport, GarmentError> {
-    let Loaded { scene, graph } = loaded;
+    let Loaded { scene, graph, asked } = loaded;
     let (primary, body) = (&scene.primary, &scene.body);
     let (poses, edges) = (primary.poses().len(), primary.edges().len());
     let pairs: Vec<_> = primary.edges().iter().map(|e| (e.from.0, e.to.0)).collect();
@@ -122,6 +140,8 @@ pub fn report(loaded: &Loaded) -> Result<SceneReport, GarmentError> {
         outside: graph.as_ref().map(|g| g.outside.clone()).unwrap_or_default(),
         initial_dead_ends: (edges + 1).saturating_sub(poses),
         reach: Reach::of_graph(primary),
+        reach_by_clip: Reach::of_each_clip(primary),
+        reach_asked: asked.as_ref().map(|asked| reach_asked(asked, primary)),
         unreached: unreached(primary),
         body_vertices: body.rest_positions.len(),
         body_triangles: body.triangles.len(),
@@ -132,6 +152,15 @@ pub fn report(loaded: &Loaded) -> Result<SceneReport, GarmentError> {
         attached: scene.garment.attached.len(),
         attached_height_m,
     })
+}
+
+fn reach_asked(asked: &AskedReach, primary: &PrimaryGraph) -> ReachAsked {
+    let named = |clip: &String| asked.clips.is_empty() || asked.clips.contains(clip);
+    let clips = primary.clips().iter().enumerate().filter(|(_, clip)| named(clip));
+    let (to, clips): (Vec<usize>, Vec<String>) = clips.map(|(i, c)| (i, c.clone())).unzip();
+    let reach = Reach::among(primary, &to);
+    let asked_s = asked.reach_s;
+    ReachAsked { asked_s, clips, reach, met: reach.median_s <= asked_s }
 }
 
 fn unreached(primary: &PrimaryGraph) -> Vec<String> {
@@ -169,10 +198,25 @@ impl fmt::Display for SceneReport {
         }
         writeln!(
             f,
-            "  reach     a given clip in {} (median), {} (90th percentile)",
+            "  reach     a given clip in {} (median), {} (90th percentile), {} at worst",
             seconds(self.reach.median_s),
-            seconds(self.reach.p90_s)
+            seconds(self.reach.p90_s),
+            seconds(self.reach.worst_s)
         )?;
+        for ClipReach { clip, reach } in &self.reach_by_clip {
+            let (median, worst) = (seconds(reach.median_s), seconds(reach.worst_s));
+            writeln!(f, "            {clip}: {median}, at worst {worst}")?;
+        }
+        if let Some(asked) = &self.reach_asked {
+            writeln!(
+                f,
+                "  reach_s   {:.2} s asked for among {}: {:.2} s, {}",
+                asked.asked_s,
+                asked.clips.join(", "),
+                asked.reach.median_s,
+                if asked.met { "met" } else { "NOT met" }
+            )?;
+        }
         if !self.unreached.is_empty() {
             writeln!(f, "  unreached {}: no way leads there", self.unreached.join(", "))?;
         }

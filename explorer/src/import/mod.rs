@@ -143,6 +143,17 @@ pub struct Loaded {
     pub scene: Scene,
     /// What fell outside the largest strongly connected component; `None` for built-in scenes.
     pub graph: Option<GraphReport>,
+    /// What the scene asks of its motion graph; `None` where it names a file or a threshold.
+    pub asked: Option<AskedReach>,
+}
+
+/// What a scene asks of a motion graph that is computed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AskedReach {
+    /// Median time to reach a given clip (s).
+    pub reach_s: f32,
+    /// Of the ways among these clips; none: among all.
+    pub clips: Vec<String>,
 }
 
 /// Loads a scene by name (`robe`, or one that is shipped as TOML) or from a file.
@@ -181,7 +192,7 @@ pub fn load_with(
 ) -> Result<Loaded, SceneError> {
     if name_or_path == "robe" {
         let scene = crate::builtin::robe(options.vertices)?;
-        return Ok(Loaded { scene, graph: None });
+        return Ok(Loaded { scene, graph: None, asked: None });
     }
     let (text, path) = scene_text(name_or_path)?;
     load_text_with(&text, &path, data_dir, options)
@@ -300,7 +311,13 @@ fn load_text_with(
         metric,
         simulator: file.simulator(place.folder()).map_err(|e| place.error(e))?,
     };
-    Ok(Loaded { scene, graph: Some(graph) })
+    let asked = match file.motion_source().map_err(|e| place.error(e))? {
+        MotionSource::Computed(Density::Reach(reach_s)) => {
+            Some(AskedReach { reach_s, clips: file.motion_graph.reach_clips })
+        }
+        _ => None,
+    };
+    Ok(Loaded { scene, graph: Some(graph), asked })
 }
 
 struct Place<'a> {

@@ -16,20 +16,47 @@ pub struct Reach {
     pub median_s: f32,
     /// Nine tenths are shorter (s).
     pub p90_s: f32,
+    /// The longest (s).
+    pub worst_s: f32,
+}
+
+/// How long it takes to one clip, from every pose that is not in it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ClipReach {
+    /// Name of the clip.
+    pub clip: String,
+    /// The times.
+    #[serde(flatten)]
+    pub reach: Reach,
 }
 
 impl Reach {
     /// Of a primary graph.
     pub fn of_graph(primary: &PrimaryGraph) -> Self {
-        let edges: Vec<_> = primary.edges().iter().map(|e| (e.from.0, e.to.0)).collect();
-        let graph = Digraph::new(primary.poses().len(), &edges);
-        let clip_of = |pose: usize| {
-            let pose = &primary.poses()[pose];
-            (!pose.transition).then_some(usize::from(pose.clip))
-        };
         let all: Vec<usize> = (0..primary.clips().len()).collect();
-        let clips: Vec<_> = (0..graph.node_count()).map(clip_of).collect();
-        Self::measure(&graph, &clips, |_| true, &all, primary.fps())
+        Self::among(primary, &all)
+    }
+
+    /// To each clip of a primary graph.
+    pub fn of_each_clip(primary: &PrimaryGraph) -> Vec<ClipReach> {
+        let (graph, clips) = Self::digraph(primary);
+        let names = primary.clips().iter().enumerate();
+        let reach = |to| Self::measure(&graph, &clips, |_| true, &[to], primary.fps());
+        names.map(|(to, clip)| ClipReach { clip: clip.clone(), reach: reach(to) }).collect()
+    }
+
+    /// Of a primary graph, by the ways that [`Reach::to_clips`] speaks of.
+    pub fn among(primary: &PrimaryGraph, to: &[usize]) -> Self {
+        let (graph, clips) = Self::digraph(primary);
+        Self::measure(&graph, &clips, starts(to, primary.clips().len()), to, primary.fps())
+    }
+
+    /// The graph's edges, and by pose the clip of which it is a recorded frame.
+    fn digraph(primary: &PrimaryGraph) -> (Digraph, Vec<Option<usize>>) {
+        let edges: Vec<_> = primary.edges().iter().map(|e| (e.from.0, e.to.0)).collect();
+        let clips = primary.poses().iter();
+        let clips = clips.map(|pose| (!pose.transition).then_some(usize::from(pose.clip)));
+        (Digraph::new(primary.poses().len(), &edges), clips.collect())
     }
 
     /// Of clips and transitions, over the component that would be kept.
@@ -53,13 +80,9 @@ impl Reach {
         let ends: Vec<u32> =
             (0..frames.len()).map(|clip| topology.clip_first[clip] + frames[clip] as u32).collect();
         let clip_of = |node: usize| ends.iter().position(|end| kept[node] < *end);
-        let starts = |clip: Option<usize>| match to {
-            _ if to.len() == frames.len() => true,
-            [_] => clip.is_some(),
-            _ => clip.is_some_and(|clip| to.contains(&clip)),
-        };
         let clips: Vec<_> = (0..kept.len()).map(clip_of).collect();
-        Self::measure(&Digraph::new(kept.len(), &edges), &clips, starts, to, fps)
+        let graph = Digraph::new(kept.len(), &edges);
+        Self::measure(&graph, &clips, starts(to, frames.len()), to, fps)
     }
 
     fn measure(
@@ -84,7 +107,16 @@ impl Reach {
                 frames => frames as f32 / fps,
             },
         };
-        Self { median_s: quantile(0.5), p90_s: quantile(0.9) }
+        Self { median_s: quantile(0.5), p90_s: quantile(0.9), worst_s: quantile(1.0) }
+    }
+}
+
+/// From where ways to these clips, of so many, are looked at.
+fn starts(to: &[usize], clips: usize) -> impl Fn(Option<usize>) -> bool {
+    move |clip| match to {
+        _ if to.len() == clips => true,
+        [_] => clip.is_some(),
+        _ => clip.is_some_and(|clip| to.contains(&clip)),
     }
 }
 
@@ -111,5 +143,6 @@ mod tests {
         all.sort_unstable();
         assert_eq!(reach.median_s as u32, all[(all.len() - 1) / 2]);
         assert_eq!(reach.p90_s as u32, all[((all.len() - 1) as f32 * 0.9) as usize]);
+        assert_eq!(reach.worst_s as u32, 40);
     }
 }

@@ -280,7 +280,19 @@ fn scene_files_say_key_and_remedy() {
     files.write("scene.toml", SCENE.replace("body.glb", "nobody.glb"));
     files.refused("nobody.glb", &["character.file"]);
     files.write("scene.toml", computed.replace("[garment]", "threshold_m = 0.2\n[garment]"));
-    assert!(files.load().unwrap().graph.unwrap().transitions > 0);
+    let loaded = files.load().unwrap();
+    assert!(loaded.graph.unwrap().transitions > 0 && loaded.asked.is_none());
+    // What was asked for and what the whole scene then has, worst of each clip included.
+    let reach = "reach_s = 9.0\nreach_clips = [\"go\"]\n[garment]";
+    files.write("scene.toml", computed.replace("[garment]", reach));
+    let report = check::report(&files.load().unwrap()).unwrap();
+    let asked = report.reach_asked.as_ref().unwrap();
+    assert_eq!((asked.asked_s, &asked.clips[..]), (9.0, &["go".to_owned()][..]));
+    assert!(asked.met && asked.reach.median_s <= 9.0, "{report}");
+    assert_eq!(report.reach_by_clip.len(), report.clips.len());
+    let worst = report.reach_by_clip.iter().map(|clip| clip.reach.worst_s);
+    assert!(worst.fold(0.0, f32::max).total_cmp(&report.reach.worst_s).is_eq(), "{report}");
+    assert!(report.to_string().contains("asked for among go: "), "{report}");
 }
 
 #[test]

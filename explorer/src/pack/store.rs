@@ -10,7 +10,9 @@ use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions};
 use protocol::manifest::{ChunkRef, ManifestError};
-use protocol::{ChunkHash, PublisherKey, SignedManifest, VersionNumber, limits, store};
+use protocol::{
+    ChunkHash, DecodeError, PublisherKey, SignedManifest, VersionNumber, limits, store,
+};
 
 /// Why something could not be read from or written to a store.
 #[derive(Debug, thiserror::Error)]
@@ -46,10 +48,7 @@ pub enum StoreError {
     #[error("the store has no version yet; `toile explore` or `toile up` publishes one")]
     Empty,
     /// A manifest that cannot be read or is not the publisher's.
-    #[error(
-        "version {number}: {source}; restore {} from a copy, or remove it: exploring publishes \
-         it again", store::version_path(*.number)
-    )]
+    #[error("version {number}: {source}{}", remedy(*.number, .source))]
     Manifest {
         /// Its number.
         number: VersionNumber,
@@ -77,6 +76,15 @@ pub enum StoreError {
     /// The publisher's key in the store is not one.
     #[error("{} in the store is not 64 hexadecimal digits", store::PUBLISHER)]
     BadPublisher,
+}
+
+/// What to do about a damaged manifest. One of another format is not damaged.
+fn remedy(number: VersionNumber, source: &ManifestError) -> String {
+    if matches!(source, ManifestError::Decode(DecodeError::UnknownVersion { .. })) {
+        return String::new();
+    }
+    let path = store::version_path(number);
+    format!("; restore {path} from a copy, or remove it: exploring publishes it again")
 }
 
 /// A folder as a store, made if it does not exist; whatever is put there is on disk when the put
@@ -227,5 +235,24 @@ async fn read(from: &dyn ObjectStore, path: &str) -> Result<Option<Bytes>, Store
         Ok(found) => found.bytes().await.map(Some).map_err(failed),
         Err(object_store::Error::NotFound { .. }) => Ok(None),
         Err(source) => Err(failed(source)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_damaged_manifest_may_be_removed_and_one_of_another_format_may_not() {
+        let said = |source: DecodeError| {
+            let source = ManifestError::Decode(source);
+            StoreError::Manifest { number: VersionNumber(7), source }.to_string()
+        };
+        let damaged = said(DecodeError::Malformed { what: "manifest", bytes: 3 });
+        assert!(damaged.contains("remove it") && damaged.contains("00007"), "{damaged}");
+        let of = |found| said(DecodeError::UnknownVersion { what: "manifest", found, known: 2 });
+        assert!(of(3).ends_with("only 2 is known; update this program"), "{}", of(3));
+        assert!(of(1).contains("version 1") && of(1).contains("older program"), "{}", of(1));
+        assert!(!of(3).contains("remove") && !of(1).contains("remove"));
     }
 }

@@ -143,6 +143,24 @@ async fn a_store_that_hangs_holds_no_shutdown_and_counts_are_written_once_it_can
     assert!(began.elapsed() < Duration::from_secs(11), "{:?}", began.elapsed());
 }
 
+#[tokio::test]
+async fn counts_whose_receipt_was_lost_count_once() {
+    let (world, store, server) = faulty(1).await;
+    let mut player = play_all(&server).await;
+    store.unanswered_puts.store(1, Ordering::Relaxed);
+    player.machine.report(five_steps());
+    player.until("an answer lost", |_| store.unanswered_puts.load(Ordering::Relaxed) == 0).await;
+    player.machine.report(five_steps());
+    player.until("more counts", |_| server.stats().traversals == 10).await;
+    server.shutdown().await;
+    let read = |number| std::fs::read(world.path(&store::telemetry_path(number))).ok();
+    let batches = (1..9).map_while(read).map(|bytes| {
+        let batch = protocol::telemetry::TelemetryBatch::decode(&bytes).unwrap();
+        batch.garments[0].edges[0].1
+    });
+    assert_eq!(batches.collect::<Vec<_>>(), [5, 5]);
+}
+
 /// A connection that was let in, with its control stream, and no credit for chunk streams.
 async fn without_credit(server: &Server) -> (quinn::Connection, quinn::SendStream) {
     let mut transport = quinn::TransportConfig::default();

@@ -21,6 +21,8 @@ pub struct Faulty {
     pub is_down: AtomicBool,
     /// So many more writes never end.
     pub hanging_puts: AtomicU32,
+    /// So many more writes are done, and the answer is lost.
+    pub unanswered_puts: AtomicU32,
     /// Each read takes so long (ms).
     pub delay_ms: AtomicU32,
     gets: AtomicUsize,
@@ -36,6 +38,7 @@ impl Faulty {
             failing: Mutex::default(),
             is_down: AtomicBool::new(false),
             hanging_puts: AtomicU32::new(0),
+            unanswered_puts: AtomicU32::new(0),
             delay_ms: AtomicU32::new(0),
             gets: AtomicUsize::new(0),
             gets_max: AtomicUsize::new(0),
@@ -96,7 +99,11 @@ impl ObjectStore for Faulty {
             return std::future::pending().await;
         }
         self.check(location)?;
-        self.inner.put_opts(location, payload, opts).await
+        let done = self.inner.put_opts(location, payload, opts).await;
+        if self.unanswered_puts.fetch_update(order, order, taken).is_ok() {
+            return Err(Error::Generic { store: "faulty", source: "the line was cut".into() });
+        }
+        done
     }
 
     async fn put_multipart_opts(
