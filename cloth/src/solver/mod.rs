@@ -113,6 +113,8 @@ pub struct Workspace {
     inverse_masses: Vec<f32>,
     free: Vec<f32>,
     self_contact: SelfContact,
+    /// What holds the cloth as a whole: inertia, air and, in a pass, bodies (kg/s^2).
+    hold: Mat3A,
     busy: Vec<limit::Edge>,
     matrix: Matrix,
     scratch: Scratch,
@@ -325,6 +327,8 @@ impl Workspace {
         self.matrix.diagonal.copy_from_slice(&self.bare);
         self.scratch.residual.copy_from_slice(&self.forces);
         self.add_contacts(model, dt, first);
+        let added = self.matrix.diagonal.iter().zip(&self.bare).map(|(now, bare)| *now - *bare);
+        let hold = added.fold(self.hold, |sum, block| sum + block);
         if !first && model.environment.self_contact {
             let pass = self_contact::Pass {
                 x: &self.x,
@@ -340,7 +344,15 @@ impl Workspace {
         self.scratch.coarse.factorise(&model.shares, &self.bare, &self.matrix.diagonal);
         let shares = &model.shares;
         let given = Given { pattern: &model.pattern, held, reference, shares, stop };
-        self.matrix.solve(given, &mut self.dx, &mut self.scratch)
+        let iterations = self.matrix.solve(given, &mut self.dx, &mut self.scratch);
+        if !first && model.attachments.is_empty() {
+            // Forces within the cloth add up to nothing, but what is left of them when iterations end
+            // does not: cloth that flies freely would be slowed or hastened.
+            let left = self.scratch.residual.iter().sum::<Vec3A>();
+            let shift = hold.inverse() * left;
+            self.dx.iter_mut().for_each(|dx| *dx += shift);
+        }
+        iterations
     }
 
     /// Matrix and right-hand side (in `forces`) of inertia, gravity, air, bending, membrane and
@@ -378,6 +390,8 @@ impl Workspace {
             }
         }
         let gravity = Vec3A::from(model.environment.gravity);
+        let mass: f32 = model.masses.iter().sum();
+        self.hold = Mat3A::from_diagonal(Vec3::splat(mass / (dt * dt)));
         for (i, d) in matrix.diagonal.iter_mut().enumerate() {
             let inertia = model.masses[i] / (dt * dt);
             *d += Mat3A::from_diagonal(Vec3::splat(inertia));
@@ -406,7 +420,9 @@ impl Workspace {
             let n = self.normals[i].normalize_or_zero();
             let speed = n.dot(self.v[i] - wind);
             let c = factor * area * speed.abs() / dt;
-            self.matrix.diagonal[i] += Mat3A::from_cols(n * n.x, n * n.y, n * n.z) * c;
+            let drag = Mat3A::from_cols(n * n.x, n * n.y, n * n.z) * c;
+            self.matrix.diagonal[i] += drag;
+            self.hold += drag;
             self.forces[i] += n * (n.dot(wind * dt) * c);
         }
     }
