@@ -16,6 +16,7 @@ import json
 import pathlib
 import shutil
 import subprocess
+import sys
 import time
 
 POLICIES = {
@@ -55,7 +56,10 @@ def scene_at(a, scene, start):
     if not start:
         return scene
     clip, frame = start.split(":")
-    text = pathlib.Path(scene).read_text() if scene.endswith(".toml") else a.scenes.joinpath(f"{scene}.toml").read_text()
+    file = pathlib.Path(scene) if scene.endswith(".toml") else a.scenes.joinpath(f"{scene}.toml")
+    if not file.exists():
+        sys.exit(f"--starts: there is no {file} to start elsewhere; a built-in scene has no file, leave --starts out")
+    text = file.read_text()
     copy = a.out / f"{pathlib.Path(scene).stem}-{clip}-{frame}.toml"
     copy.write_text(f'start = {{ clip = "{clip}", frame = {frame} }}\n{text}')
     return str(copy)
