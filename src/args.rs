@@ -9,8 +9,10 @@ use explorer::grow::policy::Policy;
 use explorer::pack::Profile;
 
 mod codec;
+mod lab;
 
 pub use codec::{Codec, CodecBench, CodecCommand, CodecContact, DecodeBench};
+pub use lab::{Lab, LabCommand, LabRun};
 
 /// Near-exhaustive precomputed cloth: explore, publish, stream, play.
 #[derive(Debug, Parser)]
@@ -275,9 +277,6 @@ pub struct Explored {
     /// The scene [default: the one that the store was explored with].
     #[arg(long)]
     pub scene: Option<String>,
-    /// Simulation threads [default: all cores].
-    #[arg(long)]
-    pub workers: Option<usize>,
 }
 
 /// `toile plot`.
@@ -319,6 +318,9 @@ pub struct Compare {
     /// Where things are.
     #[command(flatten)]
     pub explored: Explored,
+    /// Simulation threads [default: all cores].
+    #[arg(long)]
+    pub workers: Option<usize>,
     /// One JSON object on the last line of stdout.
     #[arg(long)]
     pub json: bool,
@@ -339,6 +341,9 @@ pub struct Inspect {
     /// Where things are.
     #[command(flatten)]
     pub explored: Explored,
+    /// Simulation threads [default: all cores].
+    #[arg(long)]
+    pub workers: Option<usize>,
     /// One JSON object on the last line of stdout.
     #[arg(long)]
     pub json: bool,
@@ -365,14 +370,15 @@ pub struct Simulate {
     #[arg(long)]
     pub soak: bool,
     /// Three seconds of the walk at finer steps and on finer meshes, compared as a table.
-    #[arg(long, conflicts_with_all = ["soak", "frames", "refine", "nudge", "table", "export", "picture"])]
+    #[arg(long, conflicts_with_all = ["soak", "frames", "time", "refine", "nudge", "table", "export", "picture"])]
     pub converge: bool,
     /// Divide every step by this more than usual.
     #[arg(long, default_value_t = 1, value_name = "K", visible_alias = "substeps",
           value_parser = clap::value_parser!(u32).range(1..=64))]
     pub refine: u32,
-    /// Shift the drape by so many micrometres before the first frame.
-    #[arg(long, default_value_t = 0.0, value_name = "MICRONS", allow_negative_numbers = true)]
+    /// Shift the drape by so many micrometres before the first frame, at most 10,000.
+    #[arg(long, default_value_t = 0.0, value_name = "MICRONS", allow_negative_numbers = true,
+          value_parser = nudge)]
     pub nudge: f32,
     /// Write the measures of every frame as a table.
     #[arg(long, value_name = "FILE.csv")]
@@ -465,71 +471,6 @@ pub struct Chart {
     pub bench: Option<PathBuf>,
 }
 
-/// `toile lab`.
-#[derive(Debug, Args)]
-pub struct Lab {
-    /// What to do.
-    #[command(subcommand)]
-    pub command: LabCommand,
-}
-
-/// The commands of `toile lab`.
-#[derive(Debug, Subcommand)]
-pub enum LabCommand {
-    /// Name all benches and fabrics.
-    List {
-        /// One JSON object on the last line of stdout.
-        #[arg(long)]
-        json: bool,
-    },
-    /// Run one bench. The exit code is 0 when it ran; whether it passed is printed.
-    Run(LabRun),
-    /// Run all benches and write the page of their figures, misses included.
-    Table {
-        /// Only these [default: all].
-        only: Vec<String>,
-        /// Where to write it [default: stdout].
-        #[arg(long, value_name = "FILE.md")]
-        out: Option<PathBuf>,
-        /// Fewer cases.
-        #[arg(long)]
-        quick: bool,
-    },
-}
-
-/// `toile lab run`.
-#[derive(Debug, Args)]
-pub struct LabRun {
-    /// Name of the bench, in either case.
-    pub name: String,
-    /// Size of the mesh: vertices a side of a sheet, edges along a strip, rings of a disc. An option
-    /// that a bench does not read is refused; `toile lab list` says which it reads.
-    #[arg(long, conflicts_with = "vertices")]
-    pub n: Option<u32>,
-    /// The same as a number of vertices, about; where a bench compares meshes, of the coarsest.
-    #[arg(long)]
-    pub vertices: Option<u32>,
-    /// One of the fabrics of `toile lab list` [default: the bench's own material]. Where the answer is
-    /// of cloth that cannot stretch or bend, only its weight and the other stiffness count.
-    #[arg(long)]
-    pub fabric: Option<String>,
-    /// Longest substep (s) [default: the solver's own, 1/120].
-    #[arg(long, value_name = "S", allow_negative_numbers = true)]
-    pub dt: Option<f32>,
-    /// Fewer cases.
-    #[arg(long)]
-    pub quick: bool,
-    /// One JSON object on the last line of stdout.
-    #[arg(long)]
-    pub json: bool,
-    /// Write a contact sheet.
-    #[arg(long, value_name = "FILE.png")]
-    pub picture: Option<PathBuf>,
-    /// Write the first run as an animated glTF file.
-    #[arg(long, value_name = "FILE.glb")]
-    pub export: Option<PathBuf>,
-}
-
 fn policy(text: &str) -> Result<Policy, String> {
     text.parse()
 }
@@ -571,6 +512,14 @@ fn interval(text: &str) -> Result<Duration, String> {
     range.contains(&interval).then_some(interval).ok_or_else(|| "from 10ms to 1h".to_string())
 }
 
+/// Further than this, the cloth would be through its wearer before it is simulated (um).
+const NUDGE_MAX: f32 = 1e4;
+
+fn nudge(text: &str) -> Result<f32, String> {
+    let microns = text.parse::<f32>().ok().filter(|microns| microns.abs() <= NUDGE_MAX);
+    microns.ok_or_else(|| format!("micrometres, at most {NUDGE_MAX} either way"))
+}
+
 fn wind(text: &str) -> Result<f32, String> {
     let speed = text.parse::<f32>().ok().filter(|m_s| m_s.abs() <= client_lib::free::FORCE_MAX);
     speed.ok_or_else(|| format!("metres a second, at most {}", client_lib::free::FORCE_MAX))
@@ -590,5 +539,26 @@ mod tests {
         }
         assert_eq!(interval("10ms"), Ok(Duration::from_millis(10)));
         assert!(interval("0s").is_err() && interval("2h").is_err());
+    }
+
+    #[test]
+    fn what_a_command_does_not_read_is_refused() {
+        let parse = |line: &str| Arguments::try_parse_from(line.split(' ')).map(|_| ());
+        for right in [
+            "toile plot s --out d",
+            "toile compare s --workers 1",
+            "toile simulate robe --nudge -50",
+        ] {
+            assert!(parse(right).is_ok(), "{right}");
+        }
+        for wrong in [
+            "toile plot s --out d --workers 1",
+            "toile simulate robe --converge --for 3s",
+            "toile simulate robe --nudge 1e9",
+            "toile simulate robe --nudge NaN",
+            "toile lab run S1 --n 4 --vertices 16",
+        ] {
+            assert!(parse(wrong).is_err(), "{wrong}");
+        }
     }
 }

@@ -29,7 +29,7 @@ pub fn run(a: args::Compare) -> Result<()> {
         frames: a.frames,
         seed: a.seed,
         stages: a.stages.unwrap_or_else(|| PAPER_STAGES.to_vec()),
-        workers: place::workers(a.explored.workers)?,
+        workers: place::workers(a.workers)?,
     };
     let live = Mutex::new(Live::new(Some(a.walks)));
     let tell = |done: u64| {

@@ -97,6 +97,16 @@ pub fn explore_blocking(
     }
     std::fs::create_dir_all(work)
         .with_context(|| format!("the work folder {} cannot be made", work.display()))?;
+    let inside = |store: &std::path::PathBuf| {
+        std::fs::canonicalize(work).is_ok_and(|work| work.starts_with(store))
+    };
+    if opened.folder.as_ref().is_some_and(inside) {
+        tracing::warn!(
+            "the work folder {} lies in the store: whoever is given a copy of the store is given the key \
+             that signs its versions; take a folder beside it (--work)",
+            work.display()
+        );
+    }
     let key = explorer::pack::load_or_make_key(&key_file)?;
     let simulators = simulators(scene).context("setting up the simulation")?;
     let (store, folder) = (Arc::clone(&opened.store), opened.folder.clone());

@@ -163,7 +163,7 @@ fn replayed(
     a: &args::Inspect,
 ) -> Result<Replay> {
     let simulators = simulators(&explored.scene).context("setting up the simulation")?;
-    let workers = place::workers(a.explored.workers)?;
+    let workers = place::workers(a.workers)?;
     let total = count.min(certificate.merges.len());
     let live = std::sync::Mutex::new(Live::new(Some(total as u64)));
     let tell = |done: usize| {

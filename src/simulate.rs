@@ -5,7 +5,7 @@ mod table;
 
 use std::sync::Arc;
 
-use anyhow::{Result, bail, ensure};
+use anyhow::{Result, bail};
 use client_lib::{Walk, WalkSpec};
 use explorer::pack::scene_chunk::scene_chunk;
 use explorer::scene::Scene;
@@ -43,7 +43,6 @@ struct Summary<'a> {
 /// Simulates a walk and prints what was measured.
 pub fn run(a: &args::Simulate) -> Result<()> {
     let spec = WalkSpec::parse(&a.walk)?;
-    ensure!(a.nudge.is_finite(), "--nudge {}: micrometres, a number", a.nudge);
     if a.converge {
         return converge::run(a, &spec);
     }
