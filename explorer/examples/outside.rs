@@ -8,6 +8,9 @@
 //! After 0.5, 1, 2 and 4 s of walking in the wind (m/s, along x) it prints which share of the fine
 //! vertices is more than 5 mm inside the body and how deep, how often coarse and fine cloth cut
 //! themselves, and how large the coarse cloth is; the state that it began with first. One thread.
+//!
+//! What leads the coarse cloth is that of `client_lib::free`, written once more: the explorer does not
+//! link the client (ARCHITECTURE.md, "Arrows").
 
 use std::path::Path;
 use std::time::Instant;
