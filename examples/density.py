@@ -3,7 +3,7 @@
 
     python3 examples/density.py SCENE.toml --to walk,run --seconds 8 4 2 1 0.5 --frames 2000 --out curve
 
-For every density the motion graph is computed, put into a copy of the scene, and explored until the initial
+For every density the motion graph is computed, put into a copy of the scene beside it, and explored until the initial
 pass and FRAMES more frames are simulated. Prints one Markdown row a density.
 """
 
@@ -41,18 +41,16 @@ def main():
         run(a.toile, "scene", "graph", str(a.scene), "--density", str(seconds), *to, "--out", str(graph))
         table = f'[motion_graph]\nfile = "{graph.resolve()}"\n\n'
         dense = re.sub(r"\[motion_graph\]\n.*?\n(?=\[)", lambda _: table, text, flags=re.S)
-        scene = a.scene.parent / f".density-{seconds}.toml"
+        # Beside the scene, whose paths are relative to it; it stays, so that the store can be compared and explored on.
+        scene = a.scene.parent / f"{a.scene.stem}-reach-{seconds}.toml"
         scene.write_text(dense)
-        try:
-            check = json.loads(run(a.toile, "scene", "check", str(scene), "--json"))
-            store = str(a.out / f"store-{seconds}")
-            explore = [a.toile, "explore", "--scene", str(scene), "--store", store,
-                       "--workers", a.workers, "--json", "--frames"]
-            explore[2:2] = ["--vertices", a.vertices] if a.vertices else []
-            first = json.loads(run(*explore, str(check["edges"])))
-            last = json.loads(run(*explore, str(check["edges"] + a.frames)))
-        finally:
-            scene.unlink()
+        check = json.loads(run(a.toile, "scene", "check", str(scene), "--json"))
+        store = str(a.out / f"store-{seconds}")
+        explore = [a.toile, "explore", "--scene", str(scene), "--store", store,
+                   "--workers", a.workers, "--json", "--frames"]
+        explore[2:2] = ["--vertices", a.vertices] if a.vertices else []
+        first = json.loads(run(*explore, str(check["edges"])))
+        last = json.loads(run(*explore, str(check["edges"] + a.frames)))
         size = sum(f.stat().st_size for f in pathlib.Path(store).rglob("*") if f.is_file())
         transitions = len(json.loads(graph.read_text())["transitions"])
         print(f"| {seconds} | {transitions} | {check['poses']} | {last['states']} "
