@@ -17,6 +17,9 @@ const LISTINGS: u32 = 4;
 const LITTLE: f32 = 0.5;
 /// What a push asks for, against what must be kept.
 const GENEROUS: f32 = 2.0;
+/// Share of its slack that a pair's vertices are moved by before it is looked at again: the rest is
+/// for rounding.
+const TRUSTED: f32 = 0.9;
 
 /// Vertices that move as one piece.
 #[derive(Debug, Clone, Default)]
@@ -27,11 +30,11 @@ pub(crate) struct Zones {
     ways: Vec<(Vec3A, f32)>,
 }
 
-/// When pairs were looked at, and when vertices moved.
+/// How far vertices' ends were moved in a substep.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Moves {
-    moved: Vec<u32>,
-    checked: Vec<u32>,
+    /// Each vertex's moves, one after the other (m).
+    travel: Vec<f32>,
     before: Vec<Vec3A>,
 }
 
@@ -57,6 +60,8 @@ impl SelfContact {
         ends: &mut [Vec3A],
     ) -> Bounded {
         let mut done = Bounded::default();
+        self.moves.travel.clear();
+        self.moves.travel.resize(x.len(), 0.0);
         for _ in 0..LISTINGS {
             if self.has_strayed(model, x, ends) {
                 self.find_strayed(model, x, ends);
@@ -87,8 +92,8 @@ impl SelfContact {
     }
 
     /// Gauss-Seidel over the pairs that would meet, in turn with the edges that this stretches too
-    /// far; returns whether none of either is left. After the first sweep only those pairs are
-    /// looked at of which a vertex has moved since.
+    /// far; returns whether none of either is left. A pair that is clear is looked at again when its
+    /// vertices have been moved so far that it may not be.
     fn push_apart(
         &mut self,
         model: &Model,
@@ -97,48 +102,27 @@ impl SelfContact {
         ends: &mut [Vec3A],
         done: &mut Bounded,
     ) -> bool {
-        let Moves { moved, checked, before } = &mut self.moves;
-        moved.clear();
-        moved.resize(ends.len(), 0);
-        checked.clear();
-        checked.resize(self.pairs.len(), 0);
-        // Counts what was looked at; 0 is before all.
-        let mut now = 1u32;
+        let moves = &mut self.moves;
         for _ in 0..SWEEPS {
             let mut clear = true;
             if done.moved {
-                before.clear();
-                before.extend_from_slice(ends);
+                moves.before.clear();
+                moves.before.extend_from_slice(ends);
                 clear = limit::settle(&model.mesh, inverse_masses, ends);
-                now += 1;
-                let changed = ends.iter().zip(before.iter()).map(|(now, then)| now != then);
-                moved.iter_mut().zip(changed).filter(|(_, c)| *c).for_each(|(at, _)| *at = now);
+                moves.add_all(ends);
             }
-            for (pair, checked) in self.pairs.iter().zip(checked.iter_mut()) {
-                let known =
-                    *checked > 0 && pair.vertices.iter().all(|v| moved[*v as usize] < *checked);
-                if pair.wrong || known {
-                    continue;
-                }
-                now += 1;
-                *checked = now;
-                let from = x[pair.vertices[0] as usize];
-                let (a, b) = (pair.gather(from, x), pair.gather(from, ends));
-                let floor = pair.floor();
-                if pair.is_clear(&a, &b, floor) {
-                    continue;
-                }
+            for pair in self.pairs.iter_mut().filter(|p| !p.wrong) {
+                let Some((a, b)) = pair.unclear(x, ends, moves) else { continue };
                 clear = false;
-                *checked = 0;
                 let (shares, normal) = pair.side_of_meeting(&a, &b);
-                let missing = GENEROUS * floor - normal.dot(mix(&shares, &b));
+                let missing = GENEROUS * pair.floor() - normal.dot(mix(&shares, &b));
                 let weight = |k: usize| inverse_masses[pair.vertices[k] as usize];
                 let sum: f32 = (0..4).map(|k| shares[k] * shares[k] * weight(k)).sum();
                 if missing > 0.0 && sum > 0.0 {
-                    for k in 0..4 {
+                    for (k, v) in pair.vertices.into_iter().enumerate() {
                         let push = normal * (shares[k] * weight(k) * missing / sum);
-                        ends[pair.vertices[k] as usize] += push;
-                        moved[pair.vertices[k] as usize] = now;
+                        ends[v as usize] += push;
+                        moves.travel[v as usize] += push.length();
                     }
                     done.moved = true;
                 }
@@ -159,7 +143,7 @@ impl SelfContact {
         ends: &mut [Vec3A],
         done: &mut Bounded,
     ) -> u32 {
-        let zones = &mut self.zones;
+        let (zones, moves) = (&mut self.zones, &mut self.moves);
         zones.parent.clear();
         zones.parent.extend(0..x.len() as u32);
         zones.members.clear();
@@ -168,10 +152,8 @@ impl SelfContact {
         let mut lost = 0;
         for _ in 0..ROUNDS {
             lost = 0;
-            for pair in self.pairs.iter().filter(|p| !p.wrong) {
-                let from = x[pair.vertices[0] as usize];
-                let (a, b) = (pair.gather(from, x), pair.gather(from, ends));
-                if !pair.is_clear(&a, &b, pair.floor()) {
+            for pair in self.pairs.iter_mut().filter(|p| !p.wrong) {
+                if pair.unclear(x, ends, moves).is_some() {
                     lost += 1;
                     zones.join(&pair.vertices);
                 }
@@ -179,7 +161,10 @@ impl SelfContact {
             if lost == 0 {
                 break;
             }
+            moves.before.clear();
+            moves.before.extend_from_slice(ends);
             zones.go_on(x, inverse_masses, ends);
+            moves.add_all(ends);
             done.moved = true;
         }
         done.pieces += zones.members.len() as u32;
@@ -187,7 +172,39 @@ impl SelfContact {
     }
 }
 
+impl Moves {
+    /// Adds the way of all vertices from where they were before.
+    fn add_all(&mut self, ends: &[Vec3A]) {
+        let ways = ends.iter().zip(&self.before).map(|(end, before)| end.distance(*before));
+        self.travel.iter_mut().zip(ways).for_each(|(travel, way)| *travel += way);
+    }
+}
+
 impl Pair {
+    /// Where the pair begins and ends, if it may meet on its way; what is clear is not looked at again
+    /// before it may have changed.
+    #[inline(always)]
+    fn unclear(
+        &mut self,
+        x: &[Vec3A],
+        ends: &[Vec3A],
+        moves: &Moves,
+    ) -> Option<([Vec3A; 4], [Vec3A; 4])> {
+        let gone = self.vertices.iter().map(|v| moves.travel[*v as usize]).sum::<f32>();
+        if gone <= self.clear_until {
+            return None;
+        }
+        let from = x[self.vertices[0] as usize];
+        let (a, b) = (self.gather(from, x), self.gather(from, ends));
+        match self.slack(&a, &b, self.floor()) {
+            Some(slack) => {
+                self.clear_until = gone + TRUSTED * slack;
+                None
+            }
+            None => Some((a, b)),
+        }
+    }
+
     /// What this pair must keep (m): less where it has begun nearer.
     fn floor(&self) -> f32 {
         FLOOR_M.min(0.9 * self.distance)

@@ -155,7 +155,8 @@ impl Search<'_> {
         let keep = self.keep(edges, &vertices);
         let normal = c.across / distance;
         let wrong = distance <= self.reach && self.is_wrong(fit, &vertices, edges, normal);
-        out.push(Pair { vertices, edges, normal, distance, keep, wrong });
+        let clear_until = f32::NEG_INFINITY;
+        out.push(Pair { vertices, edges, normal, distance, keep, wrong, clear_until });
     }
 
     /// Distance at which a pair begins to repel (m): the offset, or less for what is near in the rest shape.

@@ -21,6 +21,8 @@ pub(crate) struct Pair {
     pub(crate) keep: f32,
     /// Whether an outer layer lies inside an inner one here: the pair may pass, and is led to.
     pub(crate) wrong: bool,
+    /// The pair is clear while its vertices' ends were moved by no more than this together (m).
+    pub(crate) clear_until: f32,
 }
 
 /// The closest points of a pair.
@@ -64,23 +66,28 @@ impl Pair {
 
     /// Whether the parts stay further apart than `floor` (m) while every vertex moves straight
     /// from `a` to `b`: there is a plane direction in which they do at both ends, hence always,
-    /// or small steps along the way show it.
-    pub(crate) fn is_clear(&self, a: &[Vec3A; 4], b: &[Vec3A; 4], floor: f32) -> bool {
-        if slab(self.edges, self.normal, b) > floor {
-            return true;
+    /// or small steps along the way show it. If so, by how much their ends may be moved, together,
+    /// before it may be otherwise (m).
+    pub(crate) fn slack(&self, a: &[Vec3A; 4], b: &[Vec3A; 4], floor: f32) -> Option<f32> {
+        let along = slab(self.edges, self.normal, b);
+        if along > floor {
+            return Some(along - floor);
         }
         let end = Closest::of(self.edges, b);
         let distance = end.across.length();
         if distance <= floor {
-            return false;
+            return None;
         }
         let n = end.across / distance;
         if slab(self.edges, n, a) > floor {
-            return true;
+            return Some(distance - floor);
         }
         let middle = (n + self.normal).normalize_or_zero();
-        let both = slab(self.edges, middle, a).min(slab(self.edges, middle, b));
-        both > floor || self.meeting(a, b, 0.5 * floor).is_none()
+        let there = slab(self.edges, middle, b);
+        if slab(self.edges, middle, a).min(there) > floor {
+            return Some(there - floor);
+        }
+        self.meeting(a, b, 0.5 * floor).is_none().then_some(0.0)
     }
 
     /// The first time (0..=1) at which the parts come nearer than `floor` (m), but for an error on
@@ -129,6 +136,7 @@ mod tests {
             distance,
             keep: 4e-3,
             wrong: false,
+            clear_until: f32::NEG_INFINITY,
         }
     }
 
@@ -139,7 +147,7 @@ mod tests {
             let start = [Vec3A::new(x, 0.01, 0.02), face[0], face[1], face[2]];
             let end = [Vec3A::new(x, -0.01, 0.02), face[0], face[1], face[2]];
             let p = pair(false, &start);
-            assert_eq!(p.is_clear(&start, &end, 2e-4), !hits);
+            assert_eq!(p.slack(&start, &end, 2e-4).is_some(), !hits);
             let t = p.meeting(&start, &end, 1e-4);
             assert_eq!(t.is_some(), hits);
             assert!(t.is_none_or(|t| t > 0.45 && t < 0.5), "{t:?}");
@@ -152,10 +160,10 @@ mod tests {
             [Vec3A::ZERO, Vec3A::X, Vec3A::new(0.5, 1e-3, -0.5), Vec3A::new(0.5, 1e-3, 0.5)];
         let p = pair(true, &start);
         let end = start.map(|x| x + Vec3A::new(3.0, -20.0, 5.0));
-        assert!(p.is_clear(&start, &end, 2e-4));
+        assert!(p.slack(&start, &end, 2e-4).is_some());
         let mut through = end;
         through[0].y += 3e-3;
         through[1].y += 3e-3;
-        assert!(!p.is_clear(&start, &through, 2e-4));
+        assert!(p.slack(&start, &through, 2e-4).is_none());
     }
 }
