@@ -3,7 +3,7 @@
 use glam::Vec3A;
 
 use super::SelfContact;
-use super::pair::{Closest, Pair};
+use super::pair::{Closest, Pair, slab};
 use super::sieve::{Candidate, EDGES, Sieve};
 use crate::model::Model;
 use crate::tree::{Fit, Tree};
@@ -147,14 +147,20 @@ impl Search<'_> {
 
     fn add(&self, fit: &Fit, vertices: [u32; 4], edges: bool, most: f32, out: &mut Vec<Pair>) {
         let from = self.x[vertices[0] as usize];
-        let c = Closest::of(edges, &vertices.map(|v| self.x[v as usize] - from));
+        let start = vertices.map(|v| self.x[v as usize] - from);
+        let c = Closest::of(edges, &start);
         let distance = c.across.length();
         if distance > most || distance <= f32::MIN_POSITIVE {
             return;
         }
-        let keep = self.keep(edges, &vertices);
         let normal = c.across / distance;
         let wrong = distance <= self.reach && self.is_wrong(fit, &vertices, edges, normal);
+        // What is apart along one direction at both ends is so on the way.
+        let end = std::array::from_fn(|k| start[k] + self.way[vertices[k] as usize]);
+        if !wrong && slab(edges, normal, &end) > self.reach {
+            return;
+        }
+        let keep = self.keep(edges, &vertices);
         let clear_until = f32::NEG_INFINITY;
         out.push(Pair { vertices, edges, normal, distance, keep, wrong, clear_until });
     }

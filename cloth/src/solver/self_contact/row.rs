@@ -54,7 +54,8 @@ impl SelfContact {
         matrix: &mut Matrix,
         force: &mut [Vec3A],
     ) {
-        for pair in self.pairs.iter().filter(|p| p.wrong || !self.is_calm(p)) {
+        let repels = |p: &&Pair| p.wrong || !p.edges && !self.is_calm(p);
+        for pair in self.pairs.iter().filter(repels) {
             let from = pass.x[pair.vertices[0] as usize];
             let start = pair.gather(from, pass.x);
             let way = pair.vertices.map(|v| pass.way[v as usize]);
