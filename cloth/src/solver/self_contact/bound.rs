@@ -8,7 +8,7 @@ use crate::model::Model;
 use crate::solver::limit;
 
 /// Sweeps in which pairs are pushed apart one by one.
-const SWEEPS: u32 = 40;
+const SWEEPS: u32 = 16;
 /// Rounds after that, in which what would still meet moves on as one piece.
 const ROUNDS: u32 = 24;
 /// Times the pairs are listed again because something moved further than foreseen.
