@@ -234,6 +234,67 @@ mod tests {
     }
 
     #[test]
+    fn whatever_meets_on_its_way_is_listed() {
+        let mut chance = crate::lab::shapes::Chance::new(17);
+        let mut met = 0;
+        for _ in 0..12 {
+            // One sheet falls through another, turning; neither is as foreseen by up to the tolerance.
+            let flat = |u, v| Vec3::new(0.1 * u, 0.0, 0.1 * v);
+            let one = sheet(4, 4, Cut::Alternating, flat).unwrap();
+            let count = one.vertex_count();
+            let (mut p, mut t) = (one.rest_positions().to_vec(), one.triangles().to_vec());
+            t.extend(one.triangles().iter().map(|t| t.map(|v| v + count as u32)));
+            let lifted = one.rest_positions().iter().map(|p| *p + Vec3::new(0.013, 0.03, 0.017));
+            p.extend(lifted);
+            let x: Vec<Vec3A> = p.iter().map(|p| Vec3A::from(*p)).collect();
+            let mut by_chance =
+                |most: f32| Vec3A::from_array(std::array::from_fn(|_| most * chance.signed()));
+            let fall = [by_chance(0.05), by_chance(0.05)];
+            let way: Vec<Vec3A> =
+                (0..2 * count).map(|v| fall[v / count] + by_chance(0.02)).collect();
+            let (cloth, air) = (Material::default(), Environment::default());
+            let model = Model::new(Mesh::new(p, t).unwrap(), cloth, air, None, &[]).unwrap();
+            let mut contact = SelfContact::default();
+            contact.off.resize(2 * count, false);
+            contact.find(&model, &x, &way);
+            let listed: std::collections::BTreeSet<_> =
+                contact.pairs.iter().map(|p| (p.edges, p.vertices)).collect();
+            let near = |edges: bool, vertices: [u32; 4]| {
+                let stray = 0.5 * (SelfContact::reach(&model) - super::super::FLOOR_M);
+                (0..=200).any(|k| {
+                    let s = k as f32 / 200.0;
+                    let at = vertices.map(|v| x[v as usize] + way[v as usize] * s);
+                    let moved = super::super::FLOOR_M + 1.9 * stray * s;
+                    Closest::of(edges, &at).across.length() < moved
+                })
+            };
+            let other = |v: u32| v as usize >= count;
+            for v in 0..2 * count as u32 {
+                for t in model.mesh.triangles().iter().filter(|t| other(t[0]) != other(v)) {
+                    let hit = near(false, [v, t[0], t[1], t[2]]);
+                    met += u32::from(hit);
+                    let is_listed = listed.iter().any(|(edges, f)| {
+                        !edges && f[0] == v && t.iter().all(|corner| f[1..].contains(corner))
+                    });
+                    assert!(!hit || is_listed, "vertex {v} and face {t:?}");
+                }
+            }
+            let edges = model.mesh.edges();
+            for a in edges.iter().filter(|e| !other(e[0])) {
+                for b in edges.iter().filter(|e| other(e[0])) {
+                    let hit = near(true, [a[0], a[1], b[0], b[1]]);
+                    met += u32::from(hit);
+                    let is_listed = listed
+                        .iter()
+                        .any(|(edges, f)| *edges && a.iter().chain(b).all(|end| f.contains(end)));
+                    assert!(!hit || is_listed, "edges {a:?} and {b:?}");
+                }
+            }
+        }
+        assert!(met > 500, "{met}");
+    }
+
+    #[test]
     fn layers_folded_together_are_in_order_and_swapped_ones_are_not() {
         let (mesh, x) = pleats();
         let half = mesh.vertex_count() / 2;

@@ -2,16 +2,18 @@
 //!
 //! Each substep, where the first pass has led every vertex is known; `find` lists every pair of
 //! a vertex and a face, or of two edges, that may come near on the straight way there. The second
-//! pass solves with a stiff one-sided row for each pair that came too near. `bound` has the
-//! last word on positions.
+//! pass solves with a stiff one-sided row for each vertex that came too near a face. `bound` has the
+//! last word on positions, and the only one on two edges: vertices and faces of both layers hold
+//! layers apart already, and in crumpled cloth rows of edges are three of four.
 //!
 //! # Why nothing passes
 //!
 //! Vertices move straight within a substep, so a cloth that begins without crossing can only cross
 //! where a vertex passes through a face or an edge through an edge. A pair is missing from the list
 //! only if its distance at the beginning less the largest difference of its vertices' predicted
-//! ways exceeds the reach of the list; so it stays apart as long as no vertex ends further from where it was
-//! predicted than half of that, which `bound` checks at the end (and lists again if not). The
+//! ways exceeds the reach of the list, or if along its normal at the beginning it is predicted to end further
+//! apart than that; so it stays apart as long as no vertex ends further from where it was
+//! predicted than half of the reach, which `bound` checks at the end (and lists again if not). The
 //! listed pairs are checked one by one for the way really gone: each has a direction in which its
 //! parts are apart at both ends, hence always, or conservative advancement shows it. What fails is
 //! pushed apart; what fails still moves on as one piece, without relative motion. Only relative

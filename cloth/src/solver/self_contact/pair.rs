@@ -155,6 +155,33 @@ mod tests {
     }
 
     #[test]
+    fn ends_moved_by_less_than_the_slack_leave_a_pair_clear() {
+        let mut chance = crate::lab::shapes::Chance::new(3);
+        let mut clear = [0; 2];
+        for round in 0..4000 {
+            let mut by_chance =
+                |most: f32| Vec3A::from_array(std::array::from_fn(|_| most * chance.signed()));
+            let start: [Vec3A; 4] = std::array::from_fn(|_| by_chance(0.1));
+            let end = start.map(|x| x + by_chance(0.05));
+            let (edges, floor) = (round % 2 == 0, 1e-3);
+            let p = pair(edges, &start);
+            let Some(slack) = p.slack(&start, &end, floor).filter(|_| p.distance > floor) else {
+                continue;
+            };
+            clear[usize::from(edges)] += 1;
+            // All of it to one vertex, or a part to each.
+            let share =
+                |k: usize| if round % 3 == 0 { (k == round % 4) as u8 as f32 } else { 0.25 };
+            let moved: [Vec3A; 4] = std::array::from_fn(|k| {
+                let towards = by_chance(1.0).normalize_or(Vec3A::X);
+                end[k] + towards * (0.99 * slack * share(k))
+            });
+            assert!(p.slack(&start, &moved, floor).is_some(), "{round}: {slack}");
+        }
+        assert!(clear.iter().all(|count| *count > 1000), "{clear:?}");
+    }
+
+    #[test]
     fn what_moves_together_is_clear_however_far_it_goes() {
         let start =
             [Vec3A::ZERO, Vec3A::X, Vec3A::new(0.5, 1e-3, -0.5), Vec3A::new(0.5, 1e-3, 0.5)];
