@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use picture::{Drawing, Plot, Rgb};
 use protocol::StateId;
 
+use crate::compare::PAPER_STAGES;
 use crate::grow::class;
 use crate::grow::graph::Graph;
 use crate::grow::view::{KindAt, View};
@@ -45,7 +46,8 @@ pub enum ColourBy {
     Class,
 }
 
-/// The worst merge error over simulated frames, and the best prefix so far (Figure 7).
+/// The worst merge error over simulated frames, and the best prefix so far (Figure 7), with the paper's
+/// stages marked as far as they were reached.
 pub fn error_curve(graph: &Graph) -> Plot {
     let first = graph.initialised().unwrap_or(0) as usize;
     let (mut worst, mut best) = (Vec::new(), Vec::new());
@@ -60,9 +62,14 @@ pub fn error_curve(graph: &Graph) -> Plot {
         }
         best.push([frames, least.map_or(f64::NAN, |(_, error_mm)| error_mm)]);
     }
-    Plot::new("largest merge error", "frames simulated", "error (mm)")
+    let initial = worst.first().map(|[frames, _]| (*frames, "initialised".to_owned()));
+    let last = worst.last().map_or(0.0, |[frames, _]| *frames);
+    let paper = PAPER_STAGES.map(|states| (states as f64, format!("{states} states")));
+    let plot = Plot::new("largest merge error", "frames simulated", "error (mm)")
         .with("of the graph", worst)
-        .with("of the best prefix", best)
+        .with("of the best prefix", best);
+    let reached = initial.into_iter().chain(paper).filter(|(at, _)| *at <= last);
+    reached.fold(plot, |plot, (at, what)| plot.at_stage(at, &what))
 }
 
 /// How many merges have which error.

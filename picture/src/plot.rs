@@ -13,6 +13,7 @@ use paint::{Anchor, Mark};
 
 const INK: Rgb = [50, 52, 58];
 const GRID: Rgb = [226, 228, 232];
+const STAGE: Rgb = [150, 152, 158];
 /// Colours that stay apart for colour-blind eyes (Okabe and Ito 2008), in order of use.
 const COLOURS: [Rgb; 6] =
     [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [230, 159, 0], [86, 180, 233]];
@@ -38,6 +39,8 @@ pub struct Plot {
     pub size: [u32; 2],
     /// The lines, drawn in order; the first six have colours of their own.
     pub series: Vec<Series>,
+    /// Values along at which something was reached, and what: a line upwards each.
+    pub stages: Vec<(f64, String)>,
 }
 
 /// One line of a plot.
@@ -61,6 +64,7 @@ impl Plot {
             x_log: false,
             size: [640, 360],
             series: Vec::new(),
+            stages: Vec::new(),
         }
     }
 
@@ -79,6 +83,12 @@ impl Plot {
     /// The same plot with one more line.
     pub fn with(mut self, name: &str, points: Vec<[f64; 2]>) -> Self {
         self.series.push(Series { name: name.to_owned(), points });
+        self
+    }
+
+    /// The same plot with a stage marked.
+    pub fn at_stage(mut self, along: f64, what: &str) -> Self {
+        self.stages.push((along, what.to_owned()));
         self
     }
 
@@ -152,10 +162,33 @@ impl Plot {
         marks.push(Mark::line(vec![[left, bottom], [right, bottom]], 1.0, INK));
         let corner = [0.5 * (left + right), height - LINE];
         marks.push(Mark::text(corner, Anchor::Middle, INK, &self.x_label));
+        self.draw_stages([left, right], [top, bottom], &along, &mut marks);
         for (series, colour) in self.series.iter().zip(COLOURS.iter().cycle()) {
             self.draw(series, *colour, [&along, &up], &mut marks);
         }
         marks
+    }
+
+    /// Lines upwards at stages; their words above the axis, one above the other, on the side with room.
+    fn draw_stages(
+        &self,
+        [left, right]: [f32; 2],
+        [top, bottom]: [f32; 2],
+        along: &Axis,
+        marks: &mut Vec<Mark>,
+    ) {
+        let shown = self.stages.iter().filter(|(at, _)| !self.x_log || *at > 0.0);
+        for (row, (at, what)) in shown.enumerate() {
+            let x = along.place(*at);
+            if !(left..=right).contains(&x) {
+                continue;
+            }
+            marks.push(Mark::line(vec![[x, top], [x, bottom]], 1.0, STAGE));
+            let is_late = x > 0.5 * (left + right);
+            let (anchor, gap) = if is_late { (Anchor::Right, -4.0) } else { (Anchor::Left, 4.0) };
+            let corner = [x + gap, bottom - 12.0 - LINE * row as f32];
+            marks.push(Mark::text(corner, anchor, STAGE, what));
+        }
     }
 
     /// Names and colours under the title, in as many rows as they need; returns where they end.

@@ -59,6 +59,14 @@ fn the_line_is_in_the_picture_and_its_name_in_the_legend() {
 }
 
 #[test]
+fn stages_stand_where_they_were_reached_and_not_beyond() {
+    let plot = Plot::new("t", "x", "y").with("", vec![[0.0, 1.0], [100.0, 2.0]]);
+    let svg = plot.at_stage(25.0, "early").at_stage(75.0, "late").at_stage(900.0, "never").svg();
+    assert!(svg.contains("early") && svg.contains("late") && !svg.contains("never"));
+    assert_eq!(svg.matches("#96989e").count(), 4, "{svg}");
+}
+
+#[test]
 fn thinning_keeps_every_peak() {
     let mut points: Vec<_> = (0..100_000).map(|k| [f64::from(k), 1.0]).collect();
     points[77_777][1] = 9.0;
