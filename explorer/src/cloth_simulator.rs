@@ -11,7 +11,7 @@ use cloth::{
 };
 use protocol::EdgeId;
 
-use crate::grid::GridState;
+use crate::grid::{GridState, POSITION_STEP_M};
 use crate::scene::Scene;
 use crate::simulator::{Frame, FrameQuality, SimulateError, Simulator, SimulatorFactory};
 use crate::watchdog::{self, Fault};
@@ -227,7 +227,11 @@ impl ClothSimulator {
             crossings,
             crossed_frames: u64::from(crossings > 0),
             vertex_frames: world.positions.len() as u64,
-            stretch_max: measure::stretch_max(self.model.mesh(), &world.positions),
+            stretch_max: measure::stretch_max_rounded(
+                self.model.mesh(),
+                &world.positions,
+                POSITION_STEP_M,
+            ),
             speed_max_m_s: world.velocities.iter().map(|v| v.length()).fold(0.0, f32::max),
             ..FrameQuality::default()
         }

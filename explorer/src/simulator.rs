@@ -68,7 +68,8 @@ pub struct FrameQuality {
     pub crossings: u64,
     /// Frames in which there is such a pair.
     pub crossed_frames: u64,
-    /// Largest strain of an edge (0.1: 10 % longer than at rest).
+    /// Largest strain of an edge (0.1: 10 % longer than at rest), less what rounding to the grid may have
+    /// added.
     pub stretch_max: f32,
     /// Fastest vertex (m/s).
     pub speed_max_m_s: f32,

@@ -16,7 +16,7 @@ use protocol::EdgeId;
 
 use self::process::{Answer, Process};
 use crate::cloth_simulator::{ClothSimulatorFactory, to_grid, to_world};
-use crate::grid::GridState;
+use crate::grid::{GridState, POSITION_STEP_M};
 use crate::scene::Scene;
 use crate::simulator::{Frame, FrameQuality, SimulateError, Simulator, SimulatorFactory};
 use crate::watchdog;
@@ -123,7 +123,7 @@ impl PipeSimulator {
             vertex_frames: world.positions.len() as u64,
             crossings,
             crossed_frames: u64::from(crossings > 0),
-            stretch_max: measure::stretch_max(mesh, &world.positions),
+            stretch_max: measure::stretch_max_rounded(mesh, &world.positions, POSITION_STEP_M),
             speed_max_m_s: world.velocities.iter().map(|v| v.length()).fold(0.0, f32::max),
             ..FrameQuality::default()
         };
