@@ -25,6 +25,8 @@ const DETOUR: f32 = 1.3;
 /// wider cone (66 degrees) a patch of coarse cloth, pressed together and sheared, was
 /// called smooth that cut itself a few edges on.
 const SMOOTH: f32 = 0.71;
+/// Smallest cosine between a triangle's normals as it was foreseen and as it ends.
+const TURNED: f32 = 0.5;
 
 /// The tree's shape. Triangles are called by their slot: their place in the order of the leaves.
 #[derive(Debug, Clone, PartialEq)]
@@ -344,6 +346,18 @@ impl Tree {
         }
     }
 
+    /// Calls `turned` with the corners of each triangle whose normal at `ends` is further than 60 degrees from
+    /// that at the end for which the tree was fitted: what was found smooth there may not be.
+    pub(crate) fn turned(&self, fit: &Fit, ends: &[Vec3A], mut turned: impl FnMut(&[u32; 3])) {
+        for (corners, normals) in self.corners.iter().zip(&fit.normals) {
+            let [a, b, c] = corners.map(|v| ends[v as usize]);
+            let normal = (b - a).cross(c - a);
+            if normal.dot(normals[1]) < TURNED * normal.length() {
+                turned(corners);
+            }
+        }
+    }
+
     /// Unit normal of the cloth around a vertex, between beginning and end.
     pub(crate) fn vertex_normal(fit: &Fit, vertex: u32) -> Vec3A {
         fit.around[vertex as usize].0
@@ -377,7 +391,7 @@ impl Tree {
     /// lie within 45 degrees of their mean. Such a patch projects on its mean plane without folding, so nothing
     /// in it meets (Volino & Magnenat-Thalmann 1994; it is too small for its outline to close on
     /// itself). Two triangles at a common side are not compared while they are folded by less than
-    /// a right angle.
+    /// a right angle and turn by less than one.
     pub(crate) fn pairs(
         &self,
         fit: &mut Fit,
@@ -445,8 +459,10 @@ impl Tree {
     /// Whether two triangles belong to one smooth fan, or are hardly folded at their common side.
     fn is_fan(&self, fit: &Fit, i: usize, j: usize) -> bool {
         if self.across[i].contains(&(j as u32)) {
+            // What turns over on the way may pass through what it hangs on, however both end.
             let (a, b) = (fit.normals[i], fit.normals[j]);
-            if a[0].dot(b[0]).min(a[1].dot(b[1])) > 0.0 {
+            let folded = a[0].dot(b[0]).min(a[1].dot(b[1]));
+            if folded.min(a[0].dot(a[1])).min(b[0].dot(b[1])) > 0.0 {
                 return true;
             }
         }

@@ -50,3 +50,25 @@ fn a_flat_patch_whose_ends_meet_is_no_smooth_patch() {
     let strip = sheet(4, 4, Cut::Alternating, |u, v| Vec3::new(u, v, 0.0)).unwrap();
     assert!(Tree::new(&strip).whole[0], "a square has no notch");
 }
+
+#[test]
+fn what_turns_over_is_compared_with_what_it_hangs_on() {
+    let p = [Vec3::ZERO, Vec3::Y, Vec3::new(1.0, 0.5, 0.0), Vec3::new(-1.0, 0.5, 0.0)];
+    let mesh = Mesh::new(p.to_vec(), vec![[0, 2, 1], [0, 1, 3]]).unwrap();
+    let tree = Tree::new(&mesh);
+    // The wings stay flat, lean, or change sides through each other: flat before and after.
+    for (shift, is_compared) in [(0.0, false), (0.5, false), (2.0, true)] {
+        let way = [Vec3A::ZERO, Vec3A::ZERO, Vec3A::X * -shift, Vec3A::X * shift];
+        let mut fit = Fit::default();
+        tree.fit(at(&p), |v| way[v as usize], &mut fit);
+        let mut met = 0;
+        tree.pairs(&mut fit, 0.01, true, |_, _, _| met += 1);
+        assert_eq!(met > 0, is_compared, "{shift}");
+        // Foreseen to stay, they end there.
+        tree.fit(at(&p), |_| Vec3A::ZERO, &mut fit);
+        let ends: Vec<Vec3A> = p.iter().zip(way).map(|(p, way)| Vec3A::from(*p) + way).collect();
+        let mut turned = 0;
+        tree.turned(&fit, &ends, |_| turned += 1);
+        assert_eq!(turned, if is_compared { 2 } else { 0 });
+    }
+}

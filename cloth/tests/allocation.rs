@@ -21,7 +21,12 @@ fn a_warm_workspace_asks_for_no_memory() {
         for frame in 0..24u32 {
             let at = |f: u32| pose_at(&body, start + Vec3::Z * (0.4 * f as f32 / 30.0));
             let (from, to) = (at(frame), at(frame + 1));
-            let span = Span { motion: Some((&from, &to)), seconds: 1.0 / 30.0, refine: 1 };
+            let span = Span {
+                motion: Some((&from, &to)),
+                seconds: 1.0 / 30.0,
+                refine: 1,
+                sort_layers: false,
+            };
             let asked = measure(|| {
                 step(&model, &span, &mut state, &mut ws).unwrap();
             });

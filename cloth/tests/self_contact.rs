@@ -11,7 +11,7 @@ const FRAME: f32 = 1.0 / 30.0;
 fn run(model: &Model, state: &mut State, frames: usize) -> Vec<usize> {
     let mut ws = Workspace::default();
     let mut crossings = Crossings::new(model.mesh());
-    let span = Span { motion: None, seconds: FRAME, refine: 1 };
+    let span = Span { motion: None, seconds: FRAME, refine: 1, sort_layers: false };
     let mut all = Vec::new();
     for _ in 0..frames {
         step(model, &span, state, &mut ws).unwrap();
@@ -44,7 +44,7 @@ fn a_sheet_dropped_on_a_ball_folds_without_crossing() {
         Model::new(mesh, Material::default(), on_ground(), Some(body.clone()), &[]).unwrap();
     let (mut state, mut ws) = (model.rest_state(), Workspace::default());
     let pose = body.skeleton.rest_pose();
-    let span = Span { motion: Some((&pose, &pose)), seconds: FRAME, refine: 1 };
+    let span = Span { motion: Some((&pose, &pose)), seconds: FRAME, refine: 1, sort_layers: false };
     let mut crossings = Crossings::new(model.mesh());
     for frame in 0..60 {
         step(&model, &span, &mut state, &mut ws).unwrap();

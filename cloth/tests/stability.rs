@@ -25,7 +25,8 @@ fn sweep(speed: f32) -> (Model, State, f32, f32) {
     for frame in 0..10 {
         let at = |f: u32| pose_at(&body, start + Vec3::Z * (speed * f as f32 / 30.0));
         let (from, to) = (at(frame), at(frame + 1));
-        let span = Span { motion: Some((&from, &to)), seconds: 1.0 / 30.0, refine: 1 };
+        let span =
+            Span { motion: Some((&from, &to)), seconds: 1.0 / 30.0, refine: 1, sort_layers: false };
         step(&model, &span, &mut state, &mut ws).unwrap();
         let found = measure::penetration(surface, ws.body(), &state.positions, 0.005, 0.004);
         depth = depth.max(found.depth_max_m);
@@ -61,7 +62,8 @@ fn a_sheet_comes_to_rest_on_a_ball_and_on_the_ground() {
         Model::new(mesh, Material::default(), environment, Some(body.clone()), &[]).unwrap();
     let (mut state, mut ws) = (model.rest_state(), Workspace::default());
     let pose = body.skeleton.rest_pose();
-    let span = Span { motion: Some((&pose, &pose)), seconds: 1.0 / 30.0, refine: 1 };
+    let span =
+        Span { motion: Some((&pose, &pose)), seconds: 1.0 / 30.0, refine: 1, sort_layers: false };
     for _ in 0..120 {
         step(&model, &span, &mut state, &mut ws).unwrap();
     }
@@ -108,7 +110,12 @@ fn a_sheet_between_two_closing_balls_is_held_and_comes_free() {
             &[],
         )
         .unwrap();
-        let span = Span { motion: Some((&rest, &rest)), seconds: 1.0 / 30.0, refine: 1 };
+        let span = Span {
+            motion: Some((&rest, &rest)),
+            seconds: 1.0 / 30.0,
+            refine: 1,
+            sort_layers: false,
+        };
         step(&closing, &span, &mut state, &mut ws).unwrap();
         last = measure::stretch_max(model.mesh(), &state.positions);
         assert!(last < 0.15, "{last}");
@@ -140,7 +147,12 @@ fn restarts_and_repeats_are_equal_bit_for_bit() {
         for frame in 0..12 {
             let at = |f: usize| pose_at(&body, Vec3::new(0.0, 0.4, -0.2 + 0.05 * f as f32));
             let (from, to) = (at(frame), at(frame + 1));
-            let span = Span { motion: Some((&from, &to)), seconds: 1.0 / 30.0, refine: 1 };
+            let span = Span {
+                motion: Some((&from, &to)),
+                seconds: 1.0 / 30.0,
+                refine: 1,
+                sort_layers: false,
+            };
             step(&model, &span, &mut state, &mut pool[frame % workspaces]).unwrap();
         }
         state
@@ -161,7 +173,7 @@ fn a_wild_start_stays_finite() {
         *v += 40.0 * Vec3::new(noise(4), noise(5), noise(6));
     }
     for _ in 0..60 {
-        let span = Span { motion: None, seconds: 1.0 / 30.0, refine: 1 };
+        let span = Span { motion: None, seconds: 1.0 / 30.0, refine: 1, sort_layers: false };
         step(&model, &span, &mut state, &mut ws).unwrap();
     }
     assert!(measure::stretch_max(model.mesh(), &state.positions) < 0.15);

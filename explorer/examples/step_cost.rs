@@ -155,7 +155,7 @@ impl Run<'_> {
             velocities: vertices.map(|v| hips.vector(state.velocity(v))).collect(),
         };
         let seconds = 1.0 / primary.fps();
-        let span = Span { motion: Some((from, &to)), seconds, refine: 1 };
+        let span = Span { motion: Some((from, &to)), seconds, refine: 1, sort_layers: false };
         let effort = cloth::step(self.simulator.model(), &span, &mut world, ws)
             .map_err(|e| e.to_string())?;
         let inverse = to.hips().inverse();
@@ -233,7 +233,7 @@ fn pinned_sheet(n: usize) {
     let mut sum = Sum::default();
     let (mut low, mut low_p99, mut fastest) = (0.0f32, 0.0, 0.0f32);
     for _ in 0..120 {
-        let span = Span { motion: None, seconds: 1.0 / 60.0, refine: 1 };
+        let span = Span { motion: None, seconds: 1.0 / 60.0, refine: 1, sort_layers: false };
         let begun = cpu_s();
         let effort = cloth::step(&model, &span, &mut state, &mut ws).expect("a finite sheet");
         sum.seconds.push(cpu_s() - begun);

@@ -114,7 +114,7 @@ impl ClothSimulator {
         state: &GridState,
         from: &Pose,
         to: &Pose,
-        seconds: f32,
+        (seconds, sort_layers): (f32, bool),
     ) -> Result<Frame, SimulateError> {
         // Near the origin f32 is finest.
         let home =
@@ -128,7 +128,7 @@ impl ClothSimulator {
             let mut world = to_world(state, &from.hips());
             world.positions.iter_mut().for_each(|p| *p += nudge);
             let refine = self.refine * finer;
-            let span = Span { motion: Some((&from, &to)), seconds, refine };
+            let span = Span { motion: Some((&from, &to)), seconds, refine, sort_layers };
             let moved = match cloth::step(&self.model, &span, &mut world, &mut self.workspace) {
                 Ok(effort) => {
                     substeps += u64::from(effort.substeps);
@@ -300,7 +300,7 @@ impl Simulator for ClothSimulator {
         let edge = scene.primary.edge(edge);
         let from = &scene.primary.pose(edge.from).pose;
         let to = scene.primary.pose(edge.to).pose.moved(&edge.alignment());
-        self.advance(state, from, &to, 1.0 / scene.primary.fps())
+        self.advance(state, from, &to, (1.0 / scene.primary.fps(), false))
             .map_err(|e| SimulateError(format!("pose {} to pose {}: {e}", edge.from, edge.to)))
     }
 
@@ -324,8 +324,9 @@ impl Simulator for ClothSimulator {
             }
             let t = (frame as f32 / frames as f32).min(1.0);
             let to = rest.interpolate(start, t * t * (3.0 - 2.0 * t));
+            // The layers' order is the scene's; once it is there, nothing passes.
             let moved = self
-                .advance(&state, &from, &to, seconds)
+                .advance(&state, &from, &to, (seconds, frame <= u64::from(frames)))
                 .map_err(|e| SimulateError(format!("drape, frame {frame}: {e}")))?;
             (state, quality, from) = (moved.state, moved.quality, to);
         }

@@ -391,6 +391,7 @@ fn layers(stage: &mut Stage<'_>) -> Result<(), LabError> {
         let model = Model::new(mesh, material, Environment::default(), Some(body.clone()), &held)?;
         let mut sim = stage.sim(model.with_layers(layers)?, FRAME_S);
         if wrong {
+            sim.sort_layers = true;
             // The hem of the second skirt begins inside the first.
             let count = sim.state.positions.len() / 3;
             for p in &mut sim.state.positions[count..2 * count] {

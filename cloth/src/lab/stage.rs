@@ -199,6 +199,8 @@ pub struct Sim {
     pub effort: Effort,
     /// Time since the beginning (s).
     pub time_s: f32,
+    /// See [`crate::Span::sort_layers`].
+    pub sort_layers: bool,
     /// Crossings are counted in every frame whose number is a multiple; 0: never.
     pub hits_every: u64,
     /// Deepest vertex in the body after the last frame, those pinched between two parts apart (m).
@@ -344,6 +346,7 @@ impl<'a> Stage<'a> {
             effort: Effort::default(),
             time_s: 0.0,
             hits_every: 0,
+            sort_layers: false,
             depth_m: 0.0,
             frames: 0,
             run: self.runs - 1,
@@ -360,7 +363,8 @@ impl<'a> Stage<'a> {
             self.mark(Setting::Dt);
         }
         let refine = (SUBSTEP_S_MAX / sim.dt_s - 1e-3).ceil().max(1.0) as u32;
-        let span = Span { motion, seconds: sim.frame_s, refine };
+        let (seconds, sort_layers) = (sim.frame_s, sim.sort_layers);
+        let span = Span { motion, seconds, refine, sort_layers };
         let start = (self.clock)();
         sim.effort = step(&sim.model, &span, &mut sim.state, &mut sim.workspace)?;
         let took = (self.clock)() - start;

@@ -56,6 +56,9 @@ pub struct Span<'a> {
     pub seconds: f32,
     /// 1, or by how much finer than usual to divide it.
     pub refine: u32,
+    /// Whether an outer layer that lies inside an inner one is led through it, as a garment that is
+    /// draped for the first time may need. Otherwise nothing passes, whatever the order.
+    pub sort_layers: bool,
 }
 
 /// What a step took.
@@ -71,8 +74,8 @@ pub struct Effort {
     pub pairs: u32,
     /// Vertices that were moved on in one piece, so that their cloth should not cross itself.
     pub pieces: u32,
-    /// Pairs that may have crossed nevertheless.
-    pub lost: u32,
+    /// Substeps in which all of the cloth was moved on as one piece, for nothing else kept it whole.
+    pub wholes: u32,
 }
 
 /// A step that came out of bounds.
@@ -133,6 +136,7 @@ pub fn step(
 ) -> Result<Effort, StepError> {
     let ws = workspace;
     ws.begin(model, state);
+    ws.self_contact.sort_layers = span.sort_layers;
     let way = ws.body_way(model, span);
     let base = ((span.seconds / SUBSTEP_S_MAX) - 1e-3).ceil().max(1.0) as u32;
     let asked = (way / BODY_WAY_M).ceil() as u32;
@@ -486,7 +490,7 @@ impl Workspace {
             moved |= bounded.moved;
             effort.pairs += self.self_contact.pairs.len() as u32;
             effort.pieces += bounded.pieces;
-            effort.lost += bounded.lost;
+            effort.wholes += u32::from(bounded.whole);
         }
         for (i, end) in ends.iter().copied().enumerate() {
             let mut way = if moved { end - self.x[i] } else { self.dx[i] };

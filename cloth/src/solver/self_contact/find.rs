@@ -53,7 +53,8 @@ impl SelfContact {
             tree.restrict(&self.strayed, &mut fit);
         }
         let old = pairs.len();
-        let search = Search { model, tree, x, way, among: &self.strayed, reach };
+        let (among, sort) = (&self.strayed[..], self.sort_layers);
+        let search = Search { model, tree, x, way, among, reach, sort };
         tree.pairs(&mut fit, reach, true, |fit, i, j| {
             search.faces(i, j, &mut sieve);
             search.faces(j, i, &mut sieve);
@@ -82,6 +83,8 @@ struct Search<'a> {
     /// The vertices of which a pair must have one.
     among: &'a [bool],
     reach: f32,
+    /// Whether to look for layers in the wrong order.
+    sort: bool,
 }
 
 impl Search<'_> {
@@ -154,7 +157,8 @@ impl Search<'_> {
             return;
         }
         let normal = c.across / distance;
-        let wrong = distance <= self.reach && self.is_wrong(fit, &vertices, edges, normal);
+        let wrong =
+            self.sort && distance <= self.reach && self.is_wrong(fit, &vertices, edges, normal);
         // What is apart along one direction at both ends is so on the way.
         let end = std::array::from_fn(|k| start[k] + self.way[vertices[k] as usize]);
         if !wrong && slab(edges, normal, &end) > self.reach {
@@ -306,6 +310,7 @@ mod tests {
             let model = model.with_layers(of).unwrap();
             let mut contact = SelfContact::default();
             contact.off.resize(2 * half, false);
+            contact.sort_layers = true;
             contact.find(&model, &x, &still);
             // The turns are too sharp to tell.
             let middle = |v: &u32| (0.015..0.045).contains(&x[*v as usize].z);
@@ -315,6 +320,9 @@ mod tests {
             let [wrong, all] = between.fold([0, 0], |n, p| [n[0] + u32::from(p.wrong), n[1] + 1]);
             assert!(all > 100, "{all}");
             assert!(if is_wrong { wrong > all / 4 } else { wrong == 0 }, "{wrong} of {all}");
+            contact.sort_layers = false;
+            contact.find(&model, &x, &still);
+            assert!(contact.pairs.iter().all(|p| !p.wrong), "in play nothing passes");
         }
     }
 }

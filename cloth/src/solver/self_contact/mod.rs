@@ -16,15 +16,20 @@
 //! predicted than half of the reach, which `bound` checks at the end (and lists again if not). The
 //! listed pairs are checked one by one for the way really gone: each has a direction in which its
 //! parts are apart at both ends, hence always, or conservative advancement shows it. What fails is
-//! pushed apart; what fails still moves on as one piece, without relative motion. Only relative
-//! motion is ever bounded: what moves together goes as far as it likes.
+//! pushed apart; what fails still moves on in pieces, each as a rigid body, which only grow. If
+//! that does not end, all of the cloth is one piece. Only relative motion is ever bounded: what moves together goes as
+//! far as it likes.
+//!
+//! Two triangles of a smooth patch are not compared (see `tree`). That holds for the ways for which pairs were listed, so triangles that end
+//! turned from there are listed again.
 //!
 //! Where the cloth crosses itself already, the pairs all of whose vertices belong to edges and
 //! triangles that cut each other may pass, and those with one such vertex do not repel, so that
 //! `untangle` can work there and what is whole around stays so. Vertices that are held between
 //! body parts keep off other cloth as all do: layers that are pressed between an arm
-//! and the chest stay apart in the middle, and are in order when they come free. Of two layers in the
-//! wrong order the outer one is led through the inner one, at a bounded speed.
+//! and the chest stay apart in the middle, and are in order when they come free. While a garment is draped
+//! (`sort_layers`), of two layers in the wrong order the outer one is led through the inner one, at a bounded speed. In play an
+//! order told by normals would be told wrong where cloth lies in folds: there nothing passes.
 
 mod bound;
 mod find;
@@ -63,6 +68,8 @@ pub(crate) struct SelfContact {
     crossings: Vec<Crossing>,
     shifts: Vec<(Vec3A, f32)>,
     zones: bound::Zones,
+    /// See [`crate::Span::sort_layers`].
+    pub(crate) sort_layers: bool,
     moves: bound::Moves,
 }
 

@@ -28,7 +28,7 @@ impl SelfContact {
             let c = self.crossings[i];
             let triangle = model.mesh.triangles()[c.triangle as usize];
             let layer = |v: u32| model.layers.get(v as usize).copied().unwrap_or(0);
-            if layer(c.edge[0]) != layer(triangle[0]) {
+            if self.sort_layers && layer(c.edge[0]) != layer(triangle[0]) {
                 continue; // the layers' order tells more
             }
             let Some((along, shares)) = gradient(model, c.edge, triangle, ends) else { continue };
