@@ -11,6 +11,7 @@ use protocol::{SigningKey, StateId, VersionNumber};
 
 use crate::cpu::CpuClock;
 use crate::disk::free_bytes;
+use crate::grow::ahead::Ahead;
 use crate::grow::graph::Graph;
 use crate::grow::job::{JOB_STATES_MAX, JobError};
 use crate::grow::journal;
@@ -345,7 +346,7 @@ async fn run(
         || publisher.lacks_upsampler();
     physics::check(&setup, &work, simulators[0].as_mut())?;
     let stop = || (options.should_stop)();
-    let mut paused = Paused::default();
+    let (mut paused, ahead) = (Paused::default(), Arc::new(Ahead::default()));
     let mut second_chance = true;
     progress(&run.progress(&setup, &work, None));
     loop {
@@ -357,7 +358,7 @@ async fn run(
                 &setup,
                 (&mut work, &mut run),
                 (publisher, &mut behind),
-                simulators[0].as_mut(),
+                (&mut simulators, &ahead),
                 progress,
             );
             if let Some(end) = ended.await? {
@@ -376,8 +377,14 @@ async fn run(
         };
         let tags = looks(&*publisher, work.ledger().newest_tag(), options.tags_every);
         let asks = (&stop as &dyn Fn() -> bool, tags);
-        let ended =
-            round::run(&mut work, &mut simulators, &mut paused, asks, options.frames, &mut each);
+        let ended = round::run(
+            &mut work,
+            &mut simulators,
+            (&mut paused, &ahead),
+            asks,
+            options.frames,
+            &mut each,
+        );
         let ended = ended.await?;
         run.program_cpu_s = simulators.iter().map(|simulator| simulator.program_cpu_s()).sum();
         match ended {
@@ -416,11 +423,12 @@ async fn between_rounds(
     setup: &Setup<'_>,
     (work, run): (&mut Work, &mut Run),
     (publisher, behind): (&mut impl Publish, &mut bool),
-    simulator: &mut dyn Simulator,
+    (simulators, ahead): (&mut Vec<Box<dyn Simulator>>, &Arc<Ahead>),
     progress: &mut dyn FnMut(&Progress),
 ) -> Result<Option<End>, ExploreError> {
     if work.ledger().phase() == Phase::Drape {
         let stop = || (setup.options.should_stop)();
+        let simulator = simulators[0].as_mut();
         let clock = CpuClock::start();
         let mut frame = simulator.drape(&stop);
         if frame.is_err() && simulator.may_recover() && !stop() {
@@ -447,7 +455,11 @@ async fn between_rounds(
     if *behind || due(work, every) {
         let newest = work.graph().commit();
         let soon = work.ledger().is_round_of_tags();
-        publish(work, publisher, (newest, soon)).await?;
+        // Encoding has one thread.
+        let workers = round::run_ahead(work, simulators, ahead);
+        let published = publish(work, publisher, (newest, soon)).await;
+        workers.join(work, simulators)?;
+        published?;
         *behind = false;
         run.published(work);
         progress(&run.progress(setup, work, None));

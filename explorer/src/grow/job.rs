@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use protocol::{EdgeId, PoseId, StateId};
 
+use super::ahead::Use;
 use super::aim::Aims;
 use super::class::{self, Class, Classifier};
 use super::plan::{InitialJob, Plan};
@@ -58,6 +59,8 @@ pub struct Context<'a> {
     pub states_max: usize,
     /// Set when jobs are to be dropped.
     pub abandon: &'a AtomicBool,
+    /// Frames that were simulated before their turn.
+    pub ahead: Use<'a>,
 }
 
 /// A state that has an id, or one of the job's own by its place in [`Outcome::frames`].
@@ -372,13 +375,15 @@ fn simulate(
         return Err(JobError::Abandoned);
     }
     let failed = |source| JobError::Simulate { edge, depth, source };
-    let frame = simulator.step(state, edge).map_err(failed)?;
-    if frame.state.vertex_count() != context.states.vertex_count()
-        || frame.state.velocities.len() != context.states.vertex_count()
-    {
-        let text = format!("{} vertices returned", frame.state.vertex_count());
-        return Err(failed(SimulateError(text)));
-    }
+    let count = context.states.vertex_count();
+    let frame = context.ahead.frame((state, edge), || {
+        let frame = simulator.step(state, edge).map_err(failed)?;
+        if frame.state.vertex_count() != count || frame.state.velocities.len() != count {
+            let text = format!("{} vertices returned", frame.state.vertex_count());
+            return Err(failed(SimulateError(text)));
+        }
+        Ok(frame)
+    })?;
     quality.add(&frame.quality);
     let class = context.classifier.class(context.primary.edge(edge).to, &frame.state);
     Ok((frame.state, class | class::flag(&frame.quality)))

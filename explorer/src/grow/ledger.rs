@@ -364,6 +364,18 @@ impl Ledger {
         self.steering.choose(&self.graph, self.round_jobs, &free)
     }
 
+    /// Dead ends that the next round is likely to take, as far as can be told now, and how far they go.
+    pub fn likely(&self) -> (Vec<(StateId, PoseId)>, Aims) {
+        if self.phase() != Phase::Expansion {
+            return Default::default();
+        }
+        let taken = |state: StateId| self.round.jobs.contains(&Job::Expand(state));
+        let free = |state: StateId| !self.set_aside.contains(&state) && !taken(state);
+        let states = self.steering.rank(&self.graph, self.round_jobs, &free);
+        let aims = self.steering.aims(&self.graph, &states);
+        (states.into_iter().map(|s| (s, self.graph.state(s).pose)).collect(), aims)
+    }
+
     fn apply_interruption(&mut self, tagged: &TagRecord) -> Result<(), LedgerError> {
         // The round may have been interrupted before the first record of it.
         if self.round.is_done() {

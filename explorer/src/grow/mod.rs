@@ -12,6 +12,7 @@
 //! exploration is a function of the records, so a run that was killed goes on as if it had not
 //! been. A job's outcome depends on its inputs and on the snapshot of its round alone.
 
+pub mod ahead;
 pub mod aim;
 pub mod archive;
 pub mod class;

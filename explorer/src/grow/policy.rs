@@ -265,6 +265,19 @@ impl Steering {
         count: usize,
         free: &dyn Fn(StateId) -> bool,
     ) -> Vec<StateId> {
+        if self.policy == Policy::Visited {
+            self.look(graph);
+        }
+        self.rank(graph, count, free)
+    }
+
+    /// As [`Self::choose`], by visits as they were computed last.
+    pub fn rank(
+        &self,
+        graph: &Graph,
+        count: usize,
+        free: &dyn Fn(StateId) -> bool,
+    ) -> Vec<StateId> {
         let primary = Arc::clone(graph.primary());
         let inside = |state: &StateId| {
             let clip = primary.pose(graph.state(*state).pose).clip;
@@ -279,10 +292,7 @@ impl Steering {
         }
         let mut chosen = best(open.clone(), 1);
         let ranked: Vec<_> = match self.policy {
-            Policy::Visited => {
-                self.look(graph);
-                self.by_visits(graph, &open)
-            }
+            Policy::Visited => self.by_visits(graph, &open),
             _ => {
                 let place = |state: StateId| {
                     let pose = primary.pose(graph.state(state).pose);

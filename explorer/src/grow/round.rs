@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use protocol::{EdgeId, PoseId, StateId};
 
+use super::ahead::{Ahead, Use};
 use super::aim::Aims;
 use super::class::Classifier;
 use super::job::{
@@ -28,6 +29,8 @@ use crate::simulator::Simulator;
 const POLL: Duration = Duration::from_millis(50);
 /// How long to wait before a program that is out of order is tried again (ms), time after time.
 const PAUSES_MS: [u64; 4] = [250, 500, 1000, 2000];
+/// Room for so many frames is asked for before a job is run ahead of its turn: two seconds of cloth.
+const AHEAD_FRAMES: usize = 64;
 /// How many frames that were simulated before it is tried on.
 const TRIALS: u64 = 4;
 
@@ -83,7 +86,7 @@ pub struct Paused {
 pub async fn run(
     work: &mut Work,
     simulators: &mut Vec<Box<dyn Simulator>>,
-    paused: &mut Paused,
+    (paused, ahead): (&mut Paused, &Arc<Ahead>),
     (should_stop, tags): (&dyn Fn() -> bool, impl AsyncFnMut() -> Option<TagRecord>),
     frames: Option<u64>,
     each: &mut dyn FnMut(&Work, Option<&JobError>),
@@ -100,13 +103,14 @@ pub async fn run(
             None => *left = *start,
         }
     }
-    let shared = Arc::new(Shared::new(work, simulators, left, under_way));
+    let shared = Arc::new(Shared::new(work, (simulators, ahead), left, under_way));
     let workers = Workers::start(&shared, simulators);
     let ended = collect(work, &workers, &mut early, (should_stop, tags), frames, each).await;
     // Also on an error: workers still running are not waited for longer than a frame.
     let rest = workers.join(simulators);
     // Also of what is dropped: it was simulated.
-    let counted = work.add_cpu_s(rest.iter().map(|done| done.cpu_s).sum());
+    let dropped: f64 = rest.iter().map(|done| done.cpu_s).sum();
+    let counted = work.add_cpu_s(dropped + shared.ahead_cpu_s());
     if ended.is_ok() {
         counted?;
     }
@@ -116,6 +120,35 @@ pub async fn run(
         paused.keep(&starts, early, rest);
     }
     ended
+}
+
+/// Workers that run ahead of the next round while something else is done.
+pub struct RunningAhead(Workers);
+
+/// Lets workers run ahead until [`RunningAhead::join`], if there are several.
+pub fn run_ahead(
+    work: &Work,
+    simulators: &mut Vec<Box<dyn Simulator>>,
+    ahead: &Arc<Ahead>,
+) -> RunningAhead {
+    let shared = Shared::new(work, (simulators, ahead), Vec::new(), BTreeMap::new());
+    RunningAhead(Workers::start(&Arc::new(shared), simulators))
+}
+
+impl RunningAhead {
+    /// Ends it, within a frame.
+    ///
+    /// # Errors
+    /// The work folder cannot be written.
+    pub fn join(
+        self,
+        work: &mut Work,
+        simulators: &mut Vec<Box<dyn Simulator>>,
+    ) -> Result<(), WorkError> {
+        let shared = Arc::clone(&self.0.shared);
+        self.0.join(simulators);
+        work.add_cpu_s(shared.ahead_cpu_s())
+    }
 }
 
 impl Paused {
@@ -165,33 +198,53 @@ struct Shared {
     next: AtomicUsize,
     abandon: AtomicBool,
     under_way: Mutex<BTreeMap<StateId, Expansion>>,
+    ahead: Arc<Ahead>,
+    likely: Likely,
+}
+
+/// What a worker does when there are no jobs left.
+#[derive(Default)]
+struct Likely {
+    starts: Vec<(StateId, PoseId)>,
+    aims: Aims,
+    next: AtomicUsize,
+    cpu_s: Mutex<f64>,
 }
 
 impl Shared {
     fn new(
         work: &Work,
-        simulators: &[Box<dyn Simulator>],
+        (simulators, ahead): (&[Box<dyn Simulator>], &Arc<Ahead>),
         starts: Vec<Option<Start>>,
         under_way: BTreeMap<StateId, Expansion>,
     ) -> Self {
         let ledger = work.ledger();
         let tagged = ledger.is_round_of_tags();
+        let retries = simulators.iter().any(|simulator| simulator.may_recover());
+        // One worker never waits, and a program's failures are for those who asked.
+        let likely =
+            if simulators.len() > 1 && !retries { ledger.likely() } else { Default::default() };
+        ahead.make_room(work.states().state_bytes() as usize);
+        let round = ledger.round();
+        let snapshot = if round.is_done() { ledger.graph().commit() } else { round.snapshot };
         Self {
             primary: Arc::clone(work.graph().primary()),
             plan: Arc::clone(ledger.plan()),
             states: Arc::clone(work.states()),
             similar: Arc::clone(work.similar()),
             classifier: Arc::clone(work.classifier()),
-            known: ledger.interior_at(ledger.round().snapshot),
+            known: ledger.interior_at(snapshot),
             rules: *work.rules(),
             aims: Arc::clone(&ledger.round().aims),
             states_max: if tagged { TAGGED_STATES_MAX } else { JOB_STATES_MAX },
-            retries: simulators.iter().any(|simulator| simulator.may_recover()),
+            retries,
             trials: work.graph().some_frames(TRIALS),
             starts,
             next: AtomicUsize::new(ledger.round().done),
             abandon: AtomicBool::new(false),
             under_way: Mutex::new(under_way),
+            ahead: Arc::clone(ahead),
+            likely: Likely { starts: likely.0, aims: likely.1, ..Likely::default() },
         }
     }
 
@@ -207,7 +260,31 @@ impl Shared {
             aims: &self.aims,
             states_max: self.states_max,
             abandon: &self.abandon,
+            ahead: Use::Take(&self.ahead),
         }
+    }
+
+    /// Simulates what the next round is likely to ask for, until jobs are to be left or there is no room.
+    fn run_ahead(&self, simulator: &mut dyn Simulator) {
+        let clock = CpuClock::start();
+        let (aims, ahead) = (&self.likely.aims, Use::Keep(&self.ahead));
+        let context = Context { aims, ahead, ..self.context() };
+        let state_bytes = self.states.state_bytes() as usize;
+        let next = || self.likely.next.fetch_add(1, Ordering::Relaxed);
+        while let Some(&(state, pose)) = self.likely.starts.get(next()) {
+            let room = self.ahead.has_room(AHEAD_FRAMES, state_bytes);
+            let Ok(mut expansion) = Expansion::new(&context, state, pose) else { break };
+            // Whatever fails is found again by the job itself.
+            if !room || expansion.run(&context, simulator).is_err() {
+                break;
+            }
+        }
+        *self.likely.cpu_s.lock().unwrap_or_else(PoisonError::into_inner) += clock.elapsed_s();
+    }
+
+    /// What running ahead took, since this was asked last (s).
+    fn ahead_cpu_s(&self) -> f64 {
+        std::mem::take(&mut *self.likely.cpu_s.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// Takes the expansions that wait to be gone on with.
@@ -358,7 +435,9 @@ impl Drop for Workers {
 fn worker(shared: &Shared, simulator: &mut dyn Simulator, sender: &mpsc::Sender<Done>) {
     while !shared.abandon.load(Ordering::Relaxed) {
         let place = shared.next.fetch_add(1, Ordering::Relaxed);
-        let Some(start) = shared.starts.get(place) else { return };
+        let Some(start) = shared.starts.get(place) else {
+            return shared.run_ahead(simulator);
+        };
         let Some(start) = *start else { continue };
         if sender.send(shared.job(simulator, place, start)).is_err() {
             return;

@@ -46,8 +46,9 @@ fn a_pose_that_does_not_follow_is_refused() {
     assert!(error.0.contains("no edge"), "{error}");
 }
 
-/// Whether `robe-real`'s hood is up, after each of so many frames of a clip from its beginning.
-fn hood_up(frames: usize, clip: &str) -> Option<Vec<bool>> {
+/// Whether `robe-real`'s hood is up, after each of so many frames of a clip from its beginning, the drape
+/// moved by `nudge_m`.
+fn hood_up(frames: usize, clip: &str, nudge_m: f32) -> Option<Vec<bool>> {
     let data = crate::import::data_dir().filter(|d| d.join("character.glb").is_file());
     if data.is_none() {
         assert!(std::env::var_os("TOILE_REQUIRE_DATA").is_none(), "the data folder is missing");
@@ -64,7 +65,8 @@ fn hood_up(frames: usize, clip: &str) -> Option<Vec<bool>> {
     };
     let ids = || (0..primary.poses().len() as u32).map(PoseId);
     scene.start = ids().filter(|id| of_clip(*id)).min_by_key(|id| primary.pose(*id).frame).unwrap();
-    let mut walk = Straight::new(&scene, Options::default()).unwrap();
+    let options = Options { nudge_m, ..Options::default() };
+    let mut walk = Straight::new(&scene, options).unwrap();
     let step = |_| {
         let mut next = primary.out_edges(walk.pose()).map(|edge| primary.edge(edge).to);
         walk.step(next.find(|to| of_clip(*to)).unwrap()).unwrap();
@@ -75,13 +77,14 @@ fn hood_up(frames: usize, clip: &str) -> Option<Vec<bool>> {
 
 #[test]
 fn the_hood_rests_on_the_head_in_a_walk_and_falls_and_stays_down_in_a_run() {
-    let Some(walked) = hood_up(40, "walk_figure8") else { return };
+    let Some(walked) = hood_up(40, "walk_figure8", 0.0) else { return };
     assert!(walked.iter().all(|up| *up), "the hood slid off in a walk: {walked:?}");
-    let ran = hood_up(100, "run_figure8").unwrap();
-    assert!(ran[..15].iter().all(|up| *up), "the hood was never up: {ran:?}");
-    // A stride throws it up for a frame or two, no more.
-    let up = ran[60..].iter().filter(|up| **up).count();
-    assert!(up < 12, "the hood came up again in a run: {ran:?}");
+    // A stride may throw it up for a while, and when is chance: of twelve starts the hood was up in 5 to 49 of the
+    // last hundred frames, 23 in the mean.
+    let ran = [0.0, 1e-5].map(|nudge_m| hood_up(160, "run_figure8", nudge_m).unwrap());
+    assert!(ran.iter().all(|ran| ran[..15].iter().all(|up| *up)), "it was never up: {ran:?}");
+    let up = ran.iter().flat_map(|ran| &ran[60..]).filter(|up| **up).count();
+    assert!(up < 100, "it came up again in a run: {ran:?}");
 }
 
 #[test]
