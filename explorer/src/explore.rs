@@ -11,20 +11,19 @@ use protocol::{SigningKey, StateId, VersionNumber};
 
 use crate::cpu::CpuClock;
 use crate::disk::free_bytes;
-use crate::grow::ahead::Ahead;
 use crate::grow::graph::Graph;
 use crate::grow::job::{JOB_STATES_MAX, JobError};
 use crate::grow::journal;
 use crate::grow::ledger::Phase;
 use crate::grow::policy::Policy;
 use crate::grow::record::{PublishRecord, SteerRecord, TagRecord};
-use crate::grow::round::{self, Ended, Paused, RoundError};
+use crate::grow::round::{self, Crew, Ended, RoundError};
 use crate::grow::work::{Work, WorkError};
 use crate::pack::publish::codec_of;
 use crate::pack::upsampler::{self, UpsamplerSettings};
 use crate::pack::{Bound, EncodeSettings, Profile, PublishError, Publisher, collect_leftovers};
 use crate::scene::Scene;
-use crate::simulator::{SimulateError, Simulator, SimulatorFactory};
+use crate::simulator::{SimulateError, SimulatorFactory};
 use crate::tags::{Tagged, tagged_since};
 use crate::telemetry::{Walked, walked_since};
 use crate::view::GraphView;
@@ -339,14 +338,12 @@ async fn run(
     let clips = clips(scene, &options.clips)?;
     let mut run = Run::new(known);
     let workers = options.workers.clamp(1, WORKERS_MAX);
-    let mut simulators: Vec<Box<dyn Simulator>> =
-        (0..workers).map(|_| setup.simulators.simulator()).collect();
+    let mut crew = Crew::new((0..workers).map(|_| setup.simulators.simulator()).collect());
     // A store that lost versions, or a new one for an old folder, is brought up to date at once.
     let mut behind = work.ledger().published().is_some_and(|p| head < Some(p.number))
         || publisher.lacks_upsampler();
-    physics::check(&setup, &work, simulators[0].as_mut())?;
+    physics::check(&setup, &work, crew.first())?;
     let stop = || (options.should_stop)();
-    let (mut paused, ahead) = (Paused::default(), Arc::new(Ahead::default()));
     let mut second_chance = true;
     progress(&run.progress(&setup, &work, None));
     loop {
@@ -358,7 +355,7 @@ async fn run(
                 &setup,
                 (&mut work, &mut run),
                 (publisher, &mut behind),
-                (&mut simulators, &ahead),
+                &mut crew,
                 progress,
             );
             if let Some(end) = ended.await? {
@@ -377,16 +374,8 @@ async fn run(
         };
         let tags = looks(&*publisher, work.ledger().newest_tag(), options.tags_every);
         let asks = (&stop as &dyn Fn() -> bool, tags);
-        let ended = round::run(
-            &mut work,
-            &mut simulators,
-            (&mut paused, &ahead),
-            asks,
-            options.frames,
-            &mut each,
-        );
-        let ended = ended.await?;
-        run.program_cpu_s = simulators.iter().map(|simulator| simulator.program_cpu_s()).sum();
+        let ended = round::run(&mut work, &mut crew, asks, options.frames, &mut each).await?;
+        run.program_cpu_s = crew.program_cpu_s();
         match ended {
             // The next look ends it.
             Ended::Done | Ended::Frames => {}
@@ -423,12 +412,12 @@ async fn between_rounds(
     setup: &Setup<'_>,
     (work, run): (&mut Work, &mut Run),
     (publisher, behind): (&mut impl Publish, &mut bool),
-    (simulators, ahead): (&mut Vec<Box<dyn Simulator>>, &Arc<Ahead>),
+    crew: &mut Crew,
     progress: &mut dyn FnMut(&Progress),
 ) -> Result<Option<End>, ExploreError> {
     if work.ledger().phase() == Phase::Drape {
         let stop = || (setup.options.should_stop)();
-        let simulator = simulators[0].as_mut();
+        let simulator = crew.first();
         let clock = CpuClock::start();
         let mut frame = simulator.drape(&stop);
         if frame.is_err() && simulator.may_recover() && !stop() {
@@ -456,9 +445,9 @@ async fn between_rounds(
         let newest = work.graph().commit();
         let soon = work.ledger().is_round_of_tags();
         // Encoding has one thread.
-        let workers = round::run_ahead(work, simulators, ahead);
+        let workers = round::run_ahead(work, crew);
         let published = publish(work, publisher, (newest, soon)).await;
-        workers.join(work, simulators)?;
+        workers.join(work, crew)?;
         published?;
         *behind = false;
         run.published(work);

@@ -12,7 +12,7 @@ use crate::grid::GridState;
 use crate::grow::archive::Archive;
 use crate::grow::policy::{WalkModel, visits};
 use crate::scene::ClassRule;
-use crate::simulator::{Frame, FrameQuality, SimulateError};
+use crate::simulator::{Frame, FrameQuality, SimulateError, Simulator};
 
 const FRAMES: u64 = 1500;
 

@@ -41,7 +41,7 @@ pub enum Ended {
     Done,
     /// It was asked to stop: jobs in flight were dropped, the others are done.
     Stopped,
-    /// People pointed at something: what is not committed waits in [`Paused`].
+    /// People pointed at something: what is not committed waits with the crew.
     Interrupted(TagRecord),
     /// There are as many simulated frames as were asked for: jobs in flight were dropped.
     Frames,
@@ -68,10 +68,36 @@ pub enum RoundError {
     Read(std::io::Error),
 }
 
-/// What was simulated of a round that was interrupted. It lives in memory alone: where it is lost, the
-/// same is simulated once more.
+/// Who simulates, and what is kept from round to round. What it keeps lives in memory alone: where that is
+/// lost, the same is simulated once more.
+pub struct Crew {
+    /// One for each worker; none while they work.
+    simulators: Vec<Box<dyn Simulator>>,
+    paused: Paused,
+    ahead: Arc<Ahead>,
+}
+
+impl Crew {
+    /// Workers with a simulator each, at least one.
+    pub fn new(simulators: Vec<Box<dyn Simulator>>) -> Self {
+        assert!(!simulators.is_empty(), "somebody has to simulate");
+        Self { simulators, paused: Paused::default(), ahead: Arc::default() }
+    }
+
+    /// The first worker's simulator.
+    pub fn first(&mut self) -> &mut dyn Simulator {
+        self.simulators[0].as_mut()
+    }
+
+    /// What all programs took that simulate for this process (s).
+    pub fn program_cpu_s(&self) -> f64 {
+        self.simulators.iter().map(|simulator| simulator.program_cpu_s()).sum()
+    }
+}
+
+/// What was simulated of a round that was interrupted.
 #[derive(Default)]
-pub struct Paused {
+struct Paused {
     round: u64,
     ended: BTreeMap<StateId, Result<Outcome, JobError>>,
     under_way: BTreeMap<StateId, Expansion>,
@@ -85,15 +111,17 @@ pub struct Paused {
 /// The work folder cannot be read or written, or a frame of the initial pass cannot be simulated.
 pub async fn run(
     work: &mut Work,
-    simulators: &mut Vec<Box<dyn Simulator>>,
-    (paused, ahead): (&mut Paused, &Arc<Ahead>),
+    crew: &mut Crew,
     (should_stop, tags): (&dyn Fn() -> bool, impl AsyncFnMut() -> Option<TagRecord>),
     frames: Option<u64>,
     each: &mut dyn FnMut(&Work, Option<&JobError>),
 ) -> Result<Ended, RoundError> {
     let round = work.ledger().round().number;
-    let Paused { mut ended, under_way, .. } =
-        if paused.round == round { std::mem::take(paused) } else { Paused::default() };
+    let Paused { mut ended, under_way, .. } = if crew.paused.round == round {
+        std::mem::take(&mut crew.paused)
+    } else {
+        Paused::default()
+    };
     let starts = starts(work);
     let mut early = Early::new();
     let mut left = vec![None; starts.len()];
@@ -103,11 +131,11 @@ pub async fn run(
             None => *left = *start,
         }
     }
-    let shared = Arc::new(Shared::new(work, (simulators, ahead), left, under_way));
-    let workers = Workers::start(&shared, simulators);
+    let shared = Arc::new(Shared::new(work, crew, left, under_way));
+    let workers = Workers::start(&shared, &mut crew.simulators);
     let ended = collect(work, &workers, &mut early, (should_stop, tags), frames, each).await;
     // Also on an error: workers still running are not waited for longer than a frame.
-    let rest = workers.join(simulators);
+    let rest = workers.join(&mut crew.simulators);
     // Also of what is dropped: it was simulated.
     let dropped: f64 = rest.iter().map(|done| done.cpu_s).sum();
     let counted = work.add_cpu_s(dropped + shared.ahead_cpu_s());
@@ -116,8 +144,8 @@ pub async fn run(
     }
     if matches!(ended, Ok(Ended::Interrupted(_))) {
         // What no worker had taken up again, and what they leave now.
-        *paused = Paused { round, under_way: shared.under_way(), ..Paused::default() };
-        paused.keep(&starts, early, rest);
+        crew.paused = Paused { round, under_way: shared.under_way(), ..Paused::default() };
+        crew.paused.keep(&starts, early, rest);
     }
     ended
 }
@@ -126,13 +154,9 @@ pub async fn run(
 pub struct RunningAhead(Workers);
 
 /// Lets workers run ahead until [`RunningAhead::join`], if there are several.
-pub fn run_ahead(
-    work: &Work,
-    simulators: &mut Vec<Box<dyn Simulator>>,
-    ahead: &Arc<Ahead>,
-) -> RunningAhead {
-    let shared = Shared::new(work, (simulators, ahead), Vec::new(), BTreeMap::new());
-    RunningAhead(Workers::start(&Arc::new(shared), simulators))
+pub fn run_ahead(work: &Work, crew: &mut Crew) -> RunningAhead {
+    let shared = Arc::new(Shared::new(work, crew, Vec::new(), BTreeMap::new()));
+    RunningAhead(Workers::start(&shared, &mut crew.simulators))
 }
 
 impl RunningAhead {
@@ -140,13 +164,9 @@ impl RunningAhead {
     ///
     /// # Errors
     /// The work folder cannot be written.
-    pub fn join(
-        self,
-        work: &mut Work,
-        simulators: &mut Vec<Box<dyn Simulator>>,
-    ) -> Result<(), WorkError> {
+    pub fn join(self, work: &mut Work, crew: &mut Crew) -> Result<(), WorkError> {
         let shared = Arc::clone(&self.0.shared);
-        self.0.join(simulators);
+        self.0.join(&mut crew.simulators);
         work.add_cpu_s(shared.ahead_cpu_s())
     }
 }
@@ -214,17 +234,20 @@ struct Likely {
 impl Shared {
     fn new(
         work: &Work,
-        (simulators, ahead): (&[Box<dyn Simulator>], &Arc<Ahead>),
+        crew: &Crew,
         starts: Vec<Option<Start>>,
         under_way: BTreeMap<StateId, Expansion>,
     ) -> Self {
         let ledger = work.ledger();
         let tagged = ledger.is_round_of_tags();
-        let retries = simulators.iter().any(|simulator| simulator.may_recover());
+        let retries = crew.simulators.iter().any(|simulator| simulator.may_recover());
         // One worker never waits, and a program's failures are for those who asked.
-        let likely =
-            if simulators.len() > 1 && !retries { ledger.likely() } else { Default::default() };
-        ahead.make_room(work.states().state_bytes() as usize);
+        let likely = if crew.simulators.len() > 1 && !retries {
+            ledger.likely()
+        } else {
+            Default::default()
+        };
+        crew.ahead.make_room(work.states().state_bytes() as usize);
         let round = ledger.round();
         let snapshot = if round.is_done() { ledger.graph().commit() } else { round.snapshot };
         Self {
@@ -243,7 +266,7 @@ impl Shared {
             next: AtomicUsize::new(ledger.round().done),
             abandon: AtomicBool::new(false),
             under_way: Mutex::new(under_way),
-            ahead: Arc::clone(ahead),
+            ahead: Arc::clone(&crew.ahead),
             likely: Likely { starts: likely.0, aims: likely.1, ..Likely::default() },
         }
     }
